@@ -1,0 +1,1 @@
+"""Flights without sockets: the law against the bundled physics in one process."""

@@ -1,0 +1,379 @@
+"""Configuration: TOML files, validated as a whole before anything connects.
+
+A vehicle file says what the vehicle is and how it is to be controlled; a flight file names a vehicle and a trajectory,
+and may override the vehicle's [controller] and [limits] key by key. A name such as "paper" is looked up as a path
+first, then among the bundled files. Errors name the file, the key path, the value and what is allowed; a syntax error
+names the line.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from companion.control import heading
+from companion.control.law import Gains, Limits, Model, Parameters
+from companion.control.types import GRAVITY_M_S2, Vec3
+from companion.errors import InputError
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+PositiveVector = tuple[Positive, Positive, Positive]
+NotNegativeVector = tuple[NotNegative, NotNegative, NotNegative]
+FourNumbers = tuple[Finite, Finite, Finite, Finite]
+
+HEADINGS = {"damping": heading.DAMPING, "sideslip": heading.SIDESLIP, "commanded": heading.COMMANDED}
+
+
+class Section(BaseModel):
+    """Base of all sections: unknown keys are errors, numbers are numbers, and nothing changes after reading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Body(Section):
+    """[body]: the rigid body."""
+
+    mass_kg: Positive
+    inertia_kg_m2: PositiveVector
+    drag_1_s: NotNegative
+
+
+class Rotors(Section):
+    """[rotors]: four rotors, in PX4's order front right, rear left, front left, rear right for an x."""
+
+    x_m: FourNumbers
+    y_m: FourNumbers
+    yaw_moment_m: FourNumbers
+    thrust_max_n: Positive
+    lag_s: NotNegative
+    curve_factor: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class Autopilot(Section):
+    """[autopilot]: its loops, as seen from their setpoints."""
+
+    rate_lag_s: NotNegativeVector
+    rate_integral_1_s: NotNegativeVector = (0.0, 0.0, 0.0)
+    attitude_gain_1_s: PositiveVector
+    attitude_lag_s: NotNegative = 0.0
+    loop_rate_hz: Positive = 500.0
+
+
+class Link(Section):
+    """[link]: rate and age of the state, delay of the commands."""
+
+    state_rate_hz: Annotated[float, Field(ge=10.0, le=1000.0)]
+    state_age_s: Annotated[float, Field(ge=0.0, le=0.5)]
+    command_delay_s: Annotated[float, Field(ge=0.0, le=0.5)]
+
+
+class Noise(Section):
+    """[noise]: of the simulated vehicle's state, one sigma per axis."""
+
+    position_m: NotNegative
+    velocity_m_s: NotNegative
+    attitude_rad: NotNegative
+    rate_rad_s: NotNegative
+
+
+class Controller(Section):
+    """[controller]: the gain set of docs/law.md."""
+
+    k1_1_s: Positive
+    k2: Positive
+    k3_1_s: Positive
+    k4_1_s: Positive
+    gamma_1_s3: NotNegative
+    position_error_max_m: Positive
+    heading: Literal["damping", "sideslip", "commanded"]
+    heading_l1_1_s: Positive = 1.0
+    heading_l2_1_s: Positive = 1.0
+    heading_damping_1_s: Positive = 2.0
+    heading_speed_min_m_s: Positive = 0.3
+    disturbance_start: Literal["hover", "zero"] = "hover"
+    rate_lag_inversion: bool = True
+    thrust_lag_compensation: bool = True
+    prediction: bool = True
+
+
+class FlightLimits(Section):
+    """[limits]: every saturation and every bound that a flight is judged by."""
+
+    thrust_min_n: Positive
+    thrust_max_n: Positive
+    rate_max_rad_s: PositiveVector
+    tilt_max_rad: Annotated[float, Field(gt=0.0, lt=1.5708, allow_inf_nan=False)]
+    disturbance_max_m_s2: Positive
+    heading_rate_max_rad_s: Positive
+    speed_max_m_s: Positive
+    acceleration_max_m_s2: Positive
+    state_gap_max_s: Positive = 0.2
+    position_error_abort_m: Positive = 100.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> FlightLimits:
+        if self.thrust_min_n >= self.thrust_max_n:
+            raise ValueError(f"thrust_min_n {self.thrust_min_n} must be below thrust_max_n {self.thrust_max_n}")
+        return self
+
+
+class Vehicle(Section):
+    """A vehicle file (config/vehicles/*.toml)."""
+
+    name: str
+    simulated: bool = False
+    body: Body
+    rotors: Rotors
+    autopilot: Autopilot
+    link: Link
+    noise: Noise | None = None
+    controller: Controller
+    limits: FlightLimits
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Vehicle:
+        weight = self.body.mass_kg * GRAVITY_M_S2
+        most = 4.0 * self.rotors.thrust_max_n
+        if not self.limits.thrust_min_n < weight < self.limits.thrust_max_n:
+            raise ValueError(
+                f"limits.thrust_min_n {self.limits.thrust_min_n} and limits.thrust_max_n {self.limits.thrust_max_n}"
+                f" must enclose the weight {weight:.2f} N of body.mass_kg {self.body.mass_kg}"
+            )
+        if self.limits.thrust_max_n > most:
+            raise ValueError(
+                f"limits.thrust_max_n {self.limits.thrust_max_n} is more than four rotors give"
+                f" ({most:.2f} N = 4 x rotors.thrust_max_n)"
+            )
+        return self
+
+    @property
+    def delay_s(self) -> float:
+        """From the stamp of a state to the effect of the command computed from it [s]."""
+        return self.link.state_age_s + self.link.command_delay_s
+
+    @property
+    def thrust_full_n(self) -> float:
+        """Collective thrust at a command of 1 [N]."""
+        return 4.0 * self.rotors.thrust_max_n
+
+    def parameters(self) -> Parameters:
+        """The constants of the control step."""
+        c, lim = self.controller, self.limits
+        gains = Gains(
+            c.k1_1_s,
+            c.k2,
+            c.k3_1_s,
+            c.k4_1_s,
+            c.gamma_1_s3,
+            c.position_error_max_m,
+            HEADINGS[c.heading],
+            c.heading_l1_1_s,
+            c.heading_l2_1_s,
+            c.heading_damping_1_s,
+        )
+        rate_lag: Vec3 = self.autopilot.rate_lag_s if c.rate_lag_inversion else (0.0, 0.0, 0.0)
+        integral: Vec3 = self.autopilot.rate_integral_1_s if c.rate_lag_inversion else (0.0, 0.0, 0.0)
+        thrust_lag = self.rotors.lag_s if c.thrust_lag_compensation else 0.0
+        model = Model(self.body.mass_kg, GRAVITY_M_S2, self.body.drag_1_s, rate_lag, integral, thrust_lag)
+        limits = Limits(
+            lim.thrust_min_n,
+            lim.thrust_max_n,
+            lim.rate_max_rad_s,
+            lim.disturbance_max_m_s2,
+            lim.heading_rate_max_rad_s,
+            c.heading_speed_min_m_s,
+        )
+        return Parameters(gains, model, limits)
+
+
+class Start(Section):
+    """[start]: where the simulated vehicle waits in Hold."""
+
+    position_m: Vector
+    yaw_deg: Finite = 0.0
+
+
+class SimulatedWorld(Section):
+    """[world]: what acts on the simulated vehicle; the law knows nothing of it."""
+
+    force_n: Vector = (0.0, 0.0, 0.0)
+    gravity_factor: Positive = 1.0
+    wind_m_s: Vector = (0.0, 0.0, 0.0)
+    turbulence: NotNegative = 0.0
+    seed: Annotated[int, Field(ge=0)] = 1
+
+
+class Output(Section):
+    """[output]: which setpoints go to the autopilot."""
+
+    kind: Literal["rates", "attitude", "actuators"] = "rates"
+
+
+class Acceptance(Section):
+    """[acceptance]: what the flight is judged by; a summary value above its threshold misses it."""
+
+    position_rms_m: Positive | None = None
+    position_p95_m: Positive | None = None
+    position_max_m: Positive | None = None
+    vertical_rms_m: Positive | None = None
+    heading_rms_rad: Positive | None = None
+    settled_at_s: Positive | None = None
+
+    def thresholds(self) -> dict[str, float]:
+        """The thresholds that are set, by their key in the summary."""
+        return {key: value for key, value in self.model_dump().items() if value is not None}
+
+
+class Flight(Section):
+    """A flight file (config/flights/*.toml), complete: overrides are merged into `vehicle`."""
+
+    name: str
+    vehicle: Vehicle
+    trajectory: str
+    start: Start | None = None
+    world: SimulatedWorld = SimulatedWorld()
+    output: Output = Output()
+    acceptance: Acceptance = Acceptance()
+    statistics_from_s: NotNegative | None = None
+    takeoff_altitude_m: Positive = 5.0
+    after: Literal["hold", "land"] = "hold"
+
+
+def bundled_root() -> Path:
+    """The folder of the bundled configuration: `config/` of a checkout, `companion/_config` of an installed wheel."""
+    installed = Path(__file__).parent / "_config"
+    return installed if installed.is_dir() else Path(__file__).parent.parent / "config"
+
+
+def find(name: str, kind: str) -> Path:
+    """A file by its path, or by the name of a bundled one.
+
+    Args:
+        name: a path, or a bundled file's name without ending.
+        kind: "vehicles", "trajectories" or "flights".
+
+    Raises:
+        InputError: there is neither.
+    """
+    path = Path(name)
+    try:
+        if path.is_file():
+            return path
+    except (OSError, ValueError):
+        raise InputError(f"{name!r} is not a usable path") from None
+    folder = bundled_root() / kind
+    bundled = folder / f"{name}.toml"
+    if "/" not in name and bundled.is_file():
+        return bundled
+    known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
+    raise InputError(f"no {kind.rstrip('s')} file {name!r}: neither a path nor one of the bundled ones ({known})")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The contents of a TOML file, or an InputError that names the line."""
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file (UTF-8 expected): byte {error.start}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+SectionT = TypeVar("SectionT", bound=BaseModel)
+
+
+def explain(error: ValidationError) -> str:
+    """All findings of pydantic in one line: key path, value, and what is allowed."""
+    parts = []
+    for finding in error.errors():
+        where = ".".join(str(x) for x in finding["loc"])
+        message = finding["msg"].removeprefix("Value error, ")
+        message = message[0].lower() + message[1:]
+        if finding["type"] == "missing":
+            parts.append(f"{where} is missing")
+        elif finding["type"] == "extra_forbidden":
+            parts.append(f"{where} = {finding['input']!r} is not a known key")
+        elif where:
+            shown = "" if isinstance(finding["input"], dict) else f" = {finding['input']!r}"
+            parts.append(f"{where}{shown}: {message}")
+        else:
+            parts.append(message)
+    return "; ".join(parts)
+
+
+def _tuples(value: Any) -> Any:
+    """TOML's lists as tuples and its integers as they are: strict validation wants tuples."""
+    if isinstance(value, Mapping):
+        return {key: _tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    return value
+
+
+def validate(section: type[SectionT], data: Mapping[str, Any], source: str) -> SectionT:
+    """The section built from data, or an InputError with all that is wrong with it."""
+    try:
+        return section.model_validate(_tuples(data))
+    except ValidationError as error:
+        raise InputError(f"{source}: {explain(error)}") from None
+
+
+def load_vehicle(name: str, overrides: Mapping[str, Any] | None = None) -> Vehicle:
+    """The vehicle file of that name or path, with sections of `overrides` merged key by key."""
+    path = find(name, "vehicles")
+    data = read_toml(path)
+    return validate(Vehicle, merged(data, overrides or {}), str(path))
+
+
+def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `overrides` laid over it, tables merged recursively."""
+    out = dict(base)
+    for key, value in overrides.items():
+        below = out.get(key)
+        out[key] = merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return out
+
+
+def build_flight(
+    data: Mapping[str, Any], source: str, adjust: Callable[[dict[str, Any]], None] | None = None
+) -> Flight:
+    """A flight from the contents of its file; [controller], [limits] and [link] override the vehicle's.
+
+    Args:
+        data: the file's contents; `vehicle` is a name, a path or a whole table (as in a flight folder's flight.toml).
+        source: what to call the file in errors.
+        adjust: may change the merged data before it is validated (options of the command line).
+    """
+    data = dict(data)
+    overrides: dict[str, Any] = {key: data.pop(key) for key in ("controller", "limits", "link") if key in data}
+    vehicle = data.get("vehicle")
+    if vehicle is None:
+        raise InputError(f"{source}: vehicle is missing (the name of a vehicle file)")
+    if isinstance(vehicle, str):
+        path = find(vehicle, "vehicles")
+        base = read_toml(path)
+        validate(Vehicle, base, str(path))  # the vehicle's own faults are reported against its own file
+    elif isinstance(vehicle, Mapping):
+        base = dict(vehicle)
+    else:
+        raise InputError(f"{source}: vehicle = {vehicle!r}: must be the name of a vehicle file")
+    data["vehicle"] = merged(base, overrides)
+    if adjust is not None:
+        adjust(data)
+    return validate(Flight, data, source)
+
+
+def load_flight(name: str, adjust: Callable[[dict[str, Any]], None] | None = None) -> Flight:
+    """The flight file of that name or path."""
+    path = find(name, "flights")
+    return build_flight(read_toml(path), str(path), adjust)

@@ -1,0 +1,107 @@
+"""From the law's command to what an autopilot takes: thrust fraction, attitude setpoint, actuator controls."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from companion.control.law import Command, torque
+from companion.control.types import Quat, Vec3
+from companion.control.vectors import clip, quat_exp, quat_multiply, quat_normalise
+
+
+class RateSetpoint(NamedTuple):
+    """Body rates and thrust: SET_ATTITUDE_TARGET with mask 128."""
+
+    thrust: float
+    """Collective thrust as a fraction 0 to 1 of what the autopilot calls full."""
+    w: Vec3
+    """Body rates, FRD [rad/s]."""
+
+
+class AttitudeSetpoint(NamedTuple):
+    """Attitude, yaw rate and thrust: SET_ATTITUDE_TARGET with mask 3."""
+
+    thrust: float
+    """Collective thrust, 0 to 1."""
+    q: Quat
+    """Attitude, body to NED, unit length."""
+    yaw_rate: float
+    """Feed-forward about the vertical, positive clockwise from above [rad/s]."""
+
+
+class ActuatorSetpoint(NamedTuple):
+    """Normalised torque and thrust: SET_ACTUATOR_CONTROL_TARGET, group 0 (PX4 before 1.14)."""
+
+    thrust: float
+    """Collective thrust, 0 to 1."""
+    torque: Vec3
+    """About body x, y, z, -1 to 1."""
+
+
+Setpoint = RateSetpoint | AttitudeSetpoint | ActuatorSetpoint
+
+
+class Conversion(NamedTuple):
+    """The vehicle's normalisation."""
+
+    thrust_full_n: float
+    """Collective thrust at a command of 1 [N]."""
+    curve_factor: float
+    """f of thrust/full = f u^2 + (1 - f) u (PX4's THR_MDL_FAC)."""
+    attitude_gain: Vec3
+    """The attitude loop's gains [1/s]."""
+    attitude_lag: float
+    """By how much the autopilot's reference model lags behind attitude setpoints [s]; 0: it has none."""
+    inertia: Vec3
+    """[kg m^2]"""
+    torque_full_n_m: Vec3
+    """Torque at a control of 1 about body x, y, z [N m]."""
+
+
+def thrust_fraction(thrust_n: float, full_n: float, curve_factor: float) -> float:
+    """The thrust command that gives `thrust_n`: the inverse of the thrust curve, within 0 to 1."""
+    share = clip(thrust_n / full_n, 0.0, 1.0)
+    if curve_factor < 1e-6:
+        return share
+    half = 0.5 * (1.0 - curve_factor) / curve_factor
+    return math.sqrt(half * half + share / curve_factor) - half
+
+
+def rates_output(command: Command, conversion: Conversion) -> RateSetpoint:
+    """Body rates and thrust as they are."""
+    return RateSetpoint(
+        thrust_fraction(command.thrust, conversion.thrust_full_n, conversion.curve_factor), command.rates
+    )
+
+
+def attitude_output(command: Command, q: Quat, w: Vec3, conversion: Conversion) -> AttitudeSetpoint:
+    """R_cmd = R Exp(w_cmd / P_att): the attitude loop then asks its rate loop for w_cmd.
+
+    The yaw rate goes along as feed-forward about the world's z axis (px4.md 1.1), so the attitude carries no yaw error.
+    An autopilot that filters the setpoint with lag T gets it ahead by T times its own rate of change, w + tau / P_att.
+
+    Args:
+        command: what the law wants.
+        q: the attitude predicted for the time of effect.
+        w: the body rates there [rad/s].
+        conversion: the vehicle's normalisation.
+    """
+    gain, lag, rates, tau = conversion.attitude_gain, conversion.attitude_lag, command.rates, command.tau
+    lead = (
+        (rates[0] + lag * tau[0]) / gain[0] + lag * w[0],
+        (rates[1] + lag * tau[1]) / gain[1] + lag * w[1],
+        lag * w[2],
+    )
+    thrust = thrust_fraction(command.thrust, conversion.thrust_full_n, conversion.curve_factor)
+    return AttitudeSetpoint(thrust, quat_normalise(quat_multiply(q, quat_exp(lead))), command.rates[2])
+
+
+def actuator_output(command: Command, w: Vec3, conversion: Conversion) -> ActuatorSetpoint:
+    """n = J tau + S(w) J w (6) over the torque of full control, and the thrust: what actuator controls are."""
+    n = torque(command.tau, w, conversion.inertia)
+    full = conversion.torque_full_n_m
+    controls = (clip(n[0] / full[0], -1.0, 1.0), clip(n[1] / full[1], -1.0, 1.0), clip(n[2] / full[2], -1.0, 1.0))
+    return ActuatorSetpoint(
+        thrust_fraction(command.thrust, conversion.thrust_full_n, conversion.curve_factor), controls
+    )

@@ -1,0 +1,283 @@
+"""What a flight does in which order: the phases from the first heartbeat to the last, each change with a reason.
+
+The sequence asks the autopilot for things (`link.operations`) and decides what the loop does with a state: nothing,
+stream hold setpoints so that OFFBOARD can be entered, or track. It knows vehicle time only and has no sockets, so tests
+can step it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+
+from companion.config import Flight
+from companion.control.types import Vec3
+from companion.errors import RefusedError
+from companion.flight.course import Course
+from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Phase
+from companion.flight.preflight import Preflight
+from companion.frames import yaw_from_quat
+from companion.link import modes
+from companion.link.operations import Operation, Operations, Retry
+from companion.link.telemetry import VehicleState
+from companion.record.summary import PhaseChange
+from companion.trajectory.anchored import Trajectory
+
+STREAM_BEFORE_OFFBOARD_S = 1.0
+"""Hold setpoints go out for this long before OFFBOARD is asked for; PX4 needs one, older versions more."""
+OFFBOARD_TIMEOUT_S = 5.0
+TAKEOFF_TIMEOUT_S = 60.0
+LANDING_TIMEOUT_S = 120.0
+SETTLED_SPEED_M_S = 0.3
+SETTLED_FOR_S = 1.0
+HOLD_SETTLE_S = 1.0
+HANDOVER_INTERVAL_S = 0.1
+HANDOVER_TIMEOUT_S = 3.0
+CONFIRM_TIMEOUT_S = 2.5
+"""HEARTBEAT comes once per second: the longest a mode change may take to be seen there."""
+
+
+class Duty(Enum):
+    """What is due for a fresh state."""
+
+    NOTHING = "no setpoint is due"
+    STREAM = "hold setpoints, so that OFFBOARD can be entered"
+    TRACK = "setpoints that follow the course"
+
+
+class Sequence:
+    """The phases of one flight.
+
+    Args:
+        flight: the configuration.
+        trajectory: what is to be flown.
+        operations: requests to the autopilot.
+        autopilot: what it says of itself; the loop keeps it up to date.
+        engage: called with the state at which OFFBOARD was confirmed, before the first tracking step.
+        notify: called with a line for people.
+    """
+
+    def __init__(
+        self,
+        flight: Flight,
+        trajectory: Trajectory,
+        operations: Operations,
+        autopilot: Autopilot,
+        engage: Callable[[VehicleState], None],
+        notify: Callable[[str], None],
+    ) -> None:
+        self.phase = Phase.CONNECT
+        self.changes: list[PhaseChange] = []
+        self.duty = Duty.NOTHING
+        self.course: Course | None = None
+        self.engaged_at_s = 0.0
+        """Vehicle time (of state stamps) at which the course begins."""
+        self.ending: tuple[Cause, str] | None = None
+        self._flight = flight
+        self._trajectory = trajectory
+        self._ops = operations
+        self._autopilot = autopilot
+        self._engage = engage
+        self._notify = notify
+        self._preflight = Preflight(flight, operations, autopilot)
+        self._state: VehicleState | None = None
+        self._since_s = 0.0
+        self._step_s = 0.0
+        self._operation: Operation | None = None
+        self._asked = False
+        self._settled_since_s: float | None = None
+        self._confirmed_hold_s: float | None = None
+
+    # -- events ---------------------------------------------------------------------------------------------------
+
+    def enter(self, phase: Phase, now_s: float, reason: str) -> None:
+        """Changes the phase; the reason goes into the log."""
+        self.phase = phase
+        self.changes.append(PhaseChange(phase.value, now_s, reason))
+        self._since_s = now_s
+        self._operation = None
+        self._asked = False
+        self._settled_since_s = None
+        self._notify(f"{phase.value}: {reason}")
+
+    def on_state(self, state: VehicleState, now_s: float) -> None:
+        """A fresh state; called before the setpoint for it is computed."""
+        self._state = state
+        if self.phase is Phase.PREFLIGHT:
+            self._preflight.on_state(state)
+        if self.ending is None and self.duty is Duty.TRACK:
+            self._follow_course(state.t_vehicle_us * 1e-6)
+
+    def tick(self, now_s: float) -> None:
+        """Lets time pass: called at every turn of the loop.
+
+        Raises:
+            FlightEnded: there is nothing more to do.
+        """
+        self._ops.update(now_s)
+        if self.ending is not None:
+            self._hand_over(now_s)
+        elif self.phase is Phase.PREFLIGHT:
+            if self._preflight.done(now_s):
+                self._after_preflight(now_s)
+        elif self.phase is Phase.TAKEOFF:
+            self._take_off(now_s)
+        elif self.phase is Phase.JOIN and self.duty is Duty.STREAM:
+            self._enter_offboard(now_s)
+        elif self.phase is Phase.LAND:
+            self._land(now_s)
+        if self.ending is None and self.duty is Duty.TRACK:
+            self._watch_mode()
+            if self.phase is Phase.HOLD:
+                self._finish(now_s)
+
+    def end(self, cause: Cause, detail: str, now_s: float) -> None:
+        """Begins to hand over to the autopilot's Hold; the first cause stays."""
+        if self.ending is not None:
+            return
+        self.ending = (cause, detail)
+        self._step_s = now_s - HANDOVER_INTERVAL_S
+        self._since_s = now_s
+        self._notify(f"ending: {cause.value.sentence}" + (f": {detail}" if detail else ""))
+        if self.duty is not Duty.TRACK:
+            self.duty = Duty.NOTHING
+        if cause is Cause.TAKEN_OVER:  # somebody else has it: nothing more is asked for or sent
+            self.duty = Duty.NOTHING
+            raise FlightEnded(cause, detail)
+
+    # -- phases ---------------------------------------------------------------------------------------------------
+
+    def _after_preflight(self, now_s: float) -> None:
+        if self._autopilot.landed is LandedState.ON_GROUND or not self._autopilot.armed:
+            self.enter(Phase.TAKEOFF, now_s, f"all gates passed; climbing to {self._flight.takeoff_altitude_m:g} m")
+        else:
+            self._prepare_join(now_s, "all gates passed; the vehicle is in the air already")
+
+    def _take_off(self, now_s: float) -> None:
+        """NAV_TAKEOFF, then arming, then waiting until the autopilot holds up there."""
+        state = self._state
+        if self._operation is None:
+            self._operation = self._ops.takeoff(self._preflight.takeoff_amsl_m(state), now_s)
+        if self._operation.pending:
+            return
+        if not self._operation.accepted:
+            raise FlightEnded(Cause.REFUSED, self._operation.sentence)
+        if not self._asked:
+            self._asked = True
+            self._operation = self._ops.arm(now_s)
+            return
+        if now_s - self._since_s > TAKEOFF_TIMEOUT_S:
+            raise FlightEnded(Cause.REFUSED, f"no steady hold was reached within {TAKEOFF_TIMEOUT_S:g} s of take-off")
+        if not self._autopilot.armed and now_s - self._since_s > CONFIRM_TIMEOUT_S + 1.0:
+            raise FlightEnded(Cause.REFUSED, "the autopilot disarmed before it took off")
+        steady = (
+            state is not None
+            and self._autopilot.mode == modes.HOLD
+            and self._autopilot.landed is LandedState.IN_AIR
+            and max(abs(x) for x in state.v) < SETTLED_SPEED_M_S
+        )
+        if not steady:
+            self._settled_since_s = None
+        elif self._settled_since_s is None:
+            self._settled_since_s = now_s
+        elif now_s - self._settled_since_s >= SETTLED_FOR_S:
+            self._prepare_join(now_s, "the vehicle holds at its take-off height")
+
+    def _prepare_join(self, now_s: float, reason: str) -> None:
+        """Plans join and stop from where the vehicle is held, while the autopilot still has it."""
+        state = self._state
+        assert state is not None
+        hold: Vec3 = state.p
+        try:
+            self.course = Course(
+                self._trajectory, self._flight.vehicle, hold, yaw_from_quat(state.q), self._autopilot.home
+            )
+        except RefusedError as error:
+            raise FlightEnded(Cause.REFUSED, str(error)) from None
+        self.enter(Phase.JOIN, now_s, reason)
+        self.duty = Duty.STREAM
+
+    def _enter_offboard(self, now_s: float) -> None:
+        """Streams, asks for OFFBOARD, and engages when the acknowledgement and the reported mode agree."""
+        if now_s - self._since_s < STREAM_BEFORE_OFFBOARD_S:
+            return
+        if self._operation is None:
+            self._operation = self._ops.set_mode(modes.OFFBOARD, now_s, Retry(0.5, 8))
+        elif not self._operation.pending and not self._operation.accepted:
+            self.end(Cause.REFUSED, self._operation.sentence, now_s)
+        elif self._autopilot.mode == modes.OFFBOARD and self._operation.accepted and self._state is not None:
+            assert self.course is not None
+            self.duty = Duty.TRACK
+            self.engaged_at_s = self._state.t_vehicle_us * 1e-6
+            self._engage(self._state)
+            if self.course.join_s == 0.0:
+                self.enter(Phase.TRACK, self.engaged_at_s, "OFFBOARD confirmed; the law itself joins the trajectory")
+            else:
+                self._notify(f"join: OFFBOARD confirmed, {self.course.join_s:.1f} s to the start of the trajectory")
+        elif now_s - self._since_s > STREAM_BEFORE_OFFBOARD_S + OFFBOARD_TIMEOUT_S:
+            self.end(Cause.REFUSED, "the autopilot did not report OFFBOARD within 5 s", now_s)
+
+    def _follow_course(self, stamp_s: float) -> None:
+        """Track and hold begin on the course's own clock, at the state that reaches them."""
+        course = self.course
+        assert course is not None
+        t = stamp_s - self.engaged_at_s
+        if self.phase is Phase.JOIN and t >= course.join_s:
+            self.enter(Phase.TRACK, stamp_s, "the join is done")
+        elif self.phase is Phase.TRACK and t >= course.join_s + course.track_s:
+            self.enter(Phase.HOLD, stamp_s, "the trajectory is flown")
+
+    def track_time_s(self, stamp_s: float) -> float:
+        """Time on the trajectory of a state [s]; negative during the join."""
+        assert self.course is not None
+        return stamp_s - self.engaged_at_s - self.course.join_s
+
+    def _finish(self, now_s: float) -> None:
+        """After the stop: back to the autopilot, in Hold or landing."""
+        assert self.course is not None
+        if now_s - self.engaged_at_s < self.course.duration_s + HOLD_SETTLE_S:
+            return
+        if self._flight.after == "land":
+            self.duty = Duty.TRACK
+            self.enter(Phase.LAND, now_s, "the flight file asks for a landing")
+        else:
+            self.end(Cause.COMPLETED, "", now_s)
+
+    def _land(self, now_s: float) -> None:
+        if self._operation is None:
+            self._operation = self._ops.land(now_s)
+        elif self._operation.accepted:
+            self.duty = Duty.NOTHING
+        elif not self._operation.pending:
+            self.end(Cause.REFUSED, self._operation.sentence, now_s)
+            return
+        if self.duty is Duty.NOTHING and self._autopilot.landed is LandedState.ON_GROUND and not self._autopilot.armed:
+            raise FlightEnded(Cause.COMPLETED, "landed and disarmed")
+        if now_s - self._since_s > LANDING_TIMEOUT_S:
+            raise FlightEnded(Cause.STATE_LOST, f"no landing was reported within {LANDING_TIMEOUT_S:g} s")
+
+    def _watch_mode(self) -> None:
+        """Leaving OFFBOARD by anybody else's hand ends the flight."""
+        mode = self._autopilot.mode
+        asked = self.phase is Phase.LAND and self._operation is not None
+        if mode is not None and mode != modes.OFFBOARD and not asked:
+            self.end(Cause.TAKEN_OVER, f"the autopilot reports {mode.label}", self._since_s)
+
+    def _hand_over(self, now_s: float) -> None:
+        """Asks for Hold every 100 ms until it is acknowledged, then waits until it is reported, then ends."""
+        assert self.ending is not None
+        cause, detail = self.ending
+        operation = self._operation
+        if self._confirmed_hold_s is None:
+            if operation is not None and operation.what.endswith(modes.HOLD.label) and operation.accepted:
+                self._confirmed_hold_s = now_s
+                self.duty = Duty.NOTHING
+            elif now_s - self._since_s > HANDOVER_TIMEOUT_S:
+                raise FlightEnded(
+                    cause, f"{detail}; Hold was not acknowledged, the autopilot's own failsafe acts".lstrip("; ")
+                )
+            elif now_s - self._step_s >= HANDOVER_INTERVAL_S - 1e-9:
+                self._step_s = now_s
+                self._operation = self._ops.set_mode(modes.HOLD, now_s, Retry(HANDOVER_INTERVAL_S, 1))
+        elif self._autopilot.mode == modes.HOLD or now_s - self._confirmed_hold_s > CONFIRM_TIMEOUT_S:
+            raise FlightEnded(cause, detail)

@@ -1,0 +1,1 @@
+"""MAVLink as bytes: framing, the hot messages, the vehicle's state, setpoints."""

@@ -1,0 +1,198 @@
+"""MAVLink frames: finding them in bytes, checking them, building them.
+
+A parser takes whole datagrams or pieces of a serial stream, version 1 and 2, signed or not. It trusts a length only
+after the checksum: behind a bad frame the search goes on at the next byte, so one corrupted byte costs one frame.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, Protocol
+
+from fastcrc.crc16 import mcrf4xx
+
+from companion.link.codec import MessageFormat
+
+MAGIC_V1: Final = 0xFE
+MAGIC_V2: Final = 0xFD
+SIGNED: Final = 0x01
+"""Incompatibility flag of a signed frame; a frame with any other flag must not be read (MAVLink 2)."""
+SIGNATURE_BYTES: Final = 13
+
+_HEADER_V2 = struct.Struct("<BBBBBBBHB")
+_ANY_MAGIC = re.compile(b"[\xfd\xfe]")
+_UNFINISHED = -1
+_ZEROS = bytes(256)
+_CRC_EXTRA = [bytes((value,)) for value in range(256)]
+_REORDERED = 128  # a sequence step of this much or more is a late frame or a restarted sender, not a loss
+
+
+class Frame(NamedTuple):
+    """One checked MAVLink frame."""
+
+    msgid: int
+    sysid: int
+    compid: int
+    seq: int
+    payload: bytes
+    """Truncated zeros restored; longer than our definition when the sender's has more extensions."""
+    raw: bytes
+    """The frame as it came, magic to checksum or signature."""
+    arrival_wall_ns: int
+    """`time.monotonic_ns()` after the read that brought it."""
+
+
+class FrameGuard(Protocol):
+    """Message signing: THE place where frames are verified and signed."""
+
+    def verify(self, raw: bytes, msgid: int, signed: bool) -> bool:
+        """Whether this frame (its checksum is right) may be used."""
+
+    def sign(self, unsigned: bytes) -> bytes:
+        """The 13 bytes of signature for a whole frame that has the signed flag set."""
+
+
+@dataclass
+class LinkCounters:
+    """What happened on a link since it was opened."""
+
+    received: int = 0
+    """Frames handed out."""
+    bad_crc: int = 0
+    """Frames with a wrong checksum."""
+    unknown: int = 0
+    """Frames of messages that our dialect does not have; they cannot be checked and are not used."""
+    bad_signature: int = 0
+    """Frames that the guard refused."""
+    garbage_bytes: int = 0
+    """Bytes that belong to no good frame."""
+    foreign_address: int = 0
+    """Datagrams from others than the peer."""
+    unreachable: int = 0
+    """Times the network said that what was sent cannot arrive: nobody listens there, no route, interface down."""
+    sent: int = 0
+    send_dropped: int = 0
+    """Frames that were not sent: no peer yet, or the socket or line would not take them."""
+    lost: dict[tuple[int, int], int] = field(default_factory=dict)
+    """Frames missing by their sequence numbers, per sender (system, component); every sender seen has an entry.
+    A frame that comes late was counted as missing before."""
+
+
+def _length(data: bytes, at: int, end: int) -> int:
+    """Length of the frame that begins at `at`, 0 when none can, `_UNFINISHED` when it would end behind the data."""
+    magic = data[at]
+    if magic == MAGIC_V2:
+        if end - at < 3:
+            return _UNFINISHED
+        flags = data[at + 2]
+        if flags > SIGNED:
+            return 0
+        length = data[at + 1] + (12 + SIGNATURE_BYTES if flags else 12)
+    elif magic == MAGIC_V1:
+        if end - at < 2:
+            return _UNFINISHED
+        length = data[at + 1] + 8
+    else:
+        return 0
+    return length if at + length <= end else _UNFINISHED
+
+
+class FrameParser:
+    """Turns received bytes into frames and counts what is bad."""
+
+    def __init__(
+        self, formats: dict[int, MessageFormat], counters: LinkCounters, guard: FrameGuard | None = None
+    ) -> None:
+        self._formats = formats
+        self._counters = counters
+        self._guard = guard
+        self._last_seq: dict[tuple[int, int], int] = {}
+
+    def parse(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes], final: bool = True) -> int:
+        """Append the frames in `data` to `frames`; return how many bytes are done with.
+
+        Args:
+            data: one datagram, or what a stream has brought since the last byte that was done with.
+            wall_ns: when it arrived, `time.monotonic_ns()`.
+            frames: receives the good frames.
+            unknown: receives, raw, the frames of messages that we do not know, for the traffic log.
+            final: nothing will be added to `data` (a datagram). Otherwise an unfinished frame at its end is left over.
+        """
+        at = 0
+        end = len(data)
+        while at < end:
+            length = _length(data, at, end)
+            if length == _UNFINISHED and not final:
+                break
+            if length > 0:
+                raw = data if length == end else data[at : at + length]
+                following = data[at + length] if at + length < end else -1
+                if self._take(raw, following, wall_ns, frames, unknown):
+                    at += length
+                    continue
+            found = _ANY_MAGIC.search(data, at + 1)
+            to = end if found is None else found.start()
+            self._counters.garbage_bytes += to - at
+            at = to
+        return at
+
+    def _take(self, raw: bytes, following: int, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> bool:
+        """Check one whole candidate. True: its bytes are dealt with. False: the search must go on inside them."""
+        length = raw[1]
+        if raw[0] == MAGIC_V2:
+            start, seq, sysid, compid = 10, raw[4], raw[5], raw[6]
+            msgid = raw[7] | raw[8] << 8 | raw[9] << 16
+            signed = raw[2] == SIGNED
+        else:
+            start, seq, sysid, compid, msgid, signed = 6, raw[2], raw[3], raw[4], raw[5], False
+        known = self._formats.get(msgid)
+        if known is None:
+            # Cannot be checked. Believe its length only when another frame, or nothing, comes right behind it.
+            if following in {MAGIC_V1, MAGIC_V2, -1}:
+                self._counters.unknown += 1
+                unknown.append(raw)
+                return True
+            return False
+        stop = start + length
+        if mcrf4xx(raw[1:stop] + _CRC_EXTRA[known.crc_extra]) != raw[stop] | raw[stop + 1] << 8:
+            self._counters.bad_crc += 1
+            return False
+        if self._guard is not None and not self._guard.verify(raw, msgid, signed):
+            self._counters.bad_signature += 1
+            return True
+        payload = raw[start:stop]
+        if length < known.length:
+            payload += _ZEROS[: known.length - length]
+        self._count(sysid, compid, seq)
+        frames.append(Frame(msgid, sysid, compid, seq, payload, raw, wall_ns))
+        return True
+
+    def _count(self, sysid: int, compid: int, seq: int) -> None:
+        """Count a good frame and what is missing before it."""
+        sender = (sysid, compid)
+        self._counters.received += 1
+        last = self._last_seq.get(sender)
+        if last is None:
+            self._counters.lost[sender] = 0
+        else:
+            step = (seq - last) & 0xFF
+            if step == 0 or step >= _REORDERED:
+                return
+            if step > 1:
+                self._counters.lost[sender] += step - 1
+        self._last_seq[sender] = seq
+
+
+def build_frame(
+    msgid: int, payload: bytes, seq: int, sysid: int, compid: int, crc_extra: int, guard: FrameGuard | None = None
+) -> bytes:
+    """A MAVLink 2 frame around a payload: trailing zeros trimmed but for the first byte, signed by a guard."""
+    trimmed = payload.rstrip(b"\0") or payload[:1]
+    flags = 0 if guard is None else SIGNED
+    head = _HEADER_V2.pack(MAGIC_V2, len(trimmed), flags, 0, seq, sysid, compid, msgid & 0xFFFF, msgid >> 16)
+    body = head + trimmed
+    checksum = mcrf4xx(body[1:] + _CRC_EXTRA[crc_extra])
+    frame = body + checksum.to_bytes(2, "little")
+    return frame if guard is None else frame + guard.sign(frame)

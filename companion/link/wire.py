@@ -1,0 +1,192 @@
+"""The vehicle link: frames in, frames out, over one socket or line that belongs to the control loop.
+
+`receive` waits, drains and checks; `send` frames and never blocks. One link has one peer: PX4 locks on to the first
+sender and so do we, a second voice at the port is counted and not heard. Signing stands in front of everything, at
+one place (`framing.FrameGuard`).
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Final
+
+from companion.link.codec import message_formats
+from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame
+from companion.link.transport import Address, Transport, open_transport
+
+Tap = Callable[[int, bytes, int], None]
+"""Called with direction, raw frame and `time.monotonic_ns()` for every frame used or sent, and unknown ones."""
+
+TAP_IN: Final = 0
+TAP_OUT: Final = 3  # the numbers that a traffic log (.tlog) has for the directions
+
+COMPANION_COMPONENT: Final = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+_READS_MAX = 256
+
+
+class Wire:
+    """One open vehicle link. Not thread-safe: it belongs to one thread."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        system_id: int = 1,
+        component_id: int = COMPANION_COMPONENT,
+        tap: Tap | None = None,
+        guard: FrameGuard | None = None,
+    ) -> None:
+        self.system_id = system_id
+        """Own system id in what is sent: the vehicle's, as soon as that is known."""
+        self.component_id = component_id
+        """Own component id."""
+        self.counters = LinkCounters()
+        """What came, what was bad, what was lost."""
+        self.peer: Address | None = transport.fixed_peer
+        """Whom we talk to; None until a valid frame came (and always on a serial line)."""
+        self.last_foreign: Address | None = None
+        """Who else sent to our port, if anybody, for the explanation of a silent vehicle."""
+        self._transport = transport
+        self._tap = tap
+        self._guard = guard
+        self._formats = message_formats()
+        self._parser = FrameParser(self._formats, self.counters, guard)
+        self._seq = 0
+        self._leftover = b""
+        self._poll = select.poll()
+        self._poll.register(transport.fileno(), select.POLLIN)
+
+    @classmethod
+    def open(
+        cls,
+        connection: str,
+        *,
+        system_id: int = 1,
+        component_id: int = COMPANION_COMPONENT,
+        tap: Tap | None = None,
+        guard: FrameGuard | None = None,
+    ) -> Wire:
+        """Open a link by its connection string.
+
+        Args:
+            connection: `udpin:127.0.0.1:14540` waits for the vehicle at a port, `udpout:host:port` speaks first,
+                `serial:/dev/ttyAMA0:921600` is a line.
+            system_id: own system id, the vehicle's.
+            component_id: own component id.
+            tap: sees every frame, for the traffic log; must not raise or block.
+            guard: verifies and signs.
+
+        Raises:
+            InputError: the connection string, host or device name is wrong.
+            LinkError: the port or line cannot be had.
+        """
+        return cls(open_transport(connection), system_id, component_id, tap, guard)
+
+    def receive(self, timeout_s: float) -> list[Frame]:
+        """Wait for the link at most this long, then return every good frame that is there, in the order of arrival.
+
+        An empty list may come early (garbage, foreign senders): the caller watches the clock itself. One call reads a
+        bounded number of datagrams, so that a flood cannot keep it; what is left is there for the next call. A
+        timeout is rounded up to milliseconds.
+
+        Raises:
+            LinkError: the serial line is gone.
+        """
+        frames: list[Frame] = []
+        if not self._poll.poll(max(0.0, timeout_s) * 1e3):
+            return frames
+        unknown: list[bytes] = []
+        for _ in range(_READS_MAX):
+            try:
+                got = self._transport.read()
+            except OSError:  # the network's report about something sent earlier; it says nothing about what comes
+                self.counters.unreachable += 1
+                continue
+            if got is None:
+                break
+            wall_ns = time.monotonic_ns()
+            if self._transport.stream:
+                self._parse_stream(got[0], wall_ns, frames, unknown)
+            else:
+                self._parse_datagram(got[0], got[1], wall_ns, frames, unknown)
+        if self._tap is not None:
+            self._report(frames, unknown)
+        return frames
+
+    def _parse_datagram(
+        self, data: bytes, address: Address | None, wall_ns: int, frames: list[Frame], unknown: list[bytes]
+    ) -> None:
+        """Use a datagram of the peer; let the first valid frame decide who that is."""
+        if address == self.peer or self.peer is None:
+            before = len(frames)
+            self._parser.parse(data, wall_ns, frames, unknown)
+            if self.peer is None and len(frames) > before:
+                self.peer = address
+        else:
+            self.counters.foreign_address += 1
+            self.last_foreign = address
+
+    def _parse_stream(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> None:
+        """Use what a line brought, keeping an unfinished frame for the next time."""
+        data = self._leftover + data
+        done = self._parser.parse(data, wall_ns, frames, unknown, final=False)
+        self._leftover = data[done:]  # less than one frame
+
+    def _report(self, frames: list[Frame], unknown: list[bytes]) -> None:
+        """Show the tap what came."""
+        assert self._tap is not None
+        for frame in frames:
+            self._tap(TAP_IN, frame.raw, frame.arrival_wall_ns)
+        wall_ns = time.monotonic_ns()
+        for raw in unknown:
+            self._tap(TAP_IN, raw, wall_ns)
+
+    def send(self, msgid: int, payload: bytes) -> bool:
+        """Frame a payload and hand it to the system without waiting. False, and counted, when it did not go out.
+
+        Raises:
+            ValueError: our dialect has no such message (a fault of the caller).
+        """
+        known = self._formats.get(msgid)
+        if known is None:
+            raise ValueError(f"message {msgid} is not in the dialect")
+        raw = build_frame(msgid, payload, self._seq, self.system_id, self.component_id, known.crc_extra, self._guard)
+        if not self._write(raw):
+            self.counters.send_dropped += 1
+            return False
+        self._seq = (self._seq + 1) & 0xFF
+        self.counters.sent += 1
+        if self._tap is not None:
+            self._tap(TAP_OUT, raw, time.monotonic_ns())
+        return True
+
+    def _write(self, raw: bytes) -> bool:
+        """Write once; once more when what failed was an earlier datagram (that is how UDP reports "nobody listens")."""
+        for _ in range(2):
+            try:
+                return self._transport.write(raw, self.peer)
+            except OSError:
+                self.counters.unreachable += 1
+        return False
+
+    def release_peer(self) -> None:
+        """Forget a peer that is not the vehicle: the next valid frame decides again. Not for use in flight."""
+        self.peer = self._transport.fixed_peer
+
+    def fileno(self) -> int:
+        """File descriptor, to wait on it together with others."""
+        return self._transport.fileno()
+
+    def close(self) -> None:
+        """Close the link."""
+        self._transport.close()
+
+    def __enter__(self) -> Wire:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

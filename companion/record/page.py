@@ -1,0 +1,119 @@
+"""The report's frame: markup, style and script. Marks between @@ are replaced by `report`."""
+
+from typing import Final
+
+PAGE: Final = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline'; \
+style-src 'unsafe-inline'; img-src data: blob:; font-src data:">
+<title>@@TITLE@@ – flight report</title>
+<style>@@STYLE@@</style>
+</head>
+<body>
+<main>
+<header>
+<div><p class="kind">Flight report</p><h1>@@TITLE@@</h1><p class="subtitle">@@SUBTITLE@@</p></div>
+<p class="verdict @@VERDICT_CLASS@@">@@VERDICT@@</p>
+</header>
+<section class="thresholds">@@THRESHOLDS@@</section>
+<section class="tiles">@@TILES@@</section>
+<noscript><p>The figures need JavaScript. Nothing is loaded from the network.</p></noscript>
+@@FIGURES@@
+<div class="listings">@@TABLES@@</div>
+</main>
+<script>@@PLOTLY@@</script>
+<script type="application/json" id="figures">@@DATA@@</script>
+<script>@@SCRIPT@@</script>
+</body>
+</html>
+"""
+
+STYLE: Final = """
+:root { --ink: #1d2939; --soft: #667085; --line: #e4e7ec; --good: #067647; --bad: #b42318; }
+* { box-sizing: border-box; }
+body { margin: 0; background: #f5f7fa; color: var(--ink);
+  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+main { max-width: 960px; margin: 0 auto; padding: 24px 16px 48px; }
+header { display: flex; flex-wrap: wrap; gap: 8px 24px; align-items: flex-end; justify-content: space-between; }
+h1 { font-size: 28px; line-height: 1.2; margin: 0; overflow-wrap: anywhere; }
+h2 { font-size: 17px; margin: 0; }
+h3 { font-size: 15px; margin: 0 0 6px; }
+.kind { margin: 0; color: var(--soft); font-size: 13px; letter-spacing: .04em; text-transform: uppercase; }
+.subtitle { margin: 4px 0 0; color: var(--soft); }
+.subtitle b { color: var(--ink); font-weight: 600; }
+.verdict { margin: 0; padding: 6px 14px; border-radius: 999px; font-weight: 600; color: white;
+  overflow-wrap: anywhere; }
+.verdict.passed { background: var(--good); }
+.verdict.missed { background: var(--bad); border-radius: 14px; }
+.thresholds { margin: 14px 0; }
+.thresholds p { margin: 0; color: var(--soft); }
+.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(168px, 1fr)); gap: 10px; margin: 14px 0; }
+.tile, .figure, .listing { background: white; border: 1px solid var(--line); border-radius: 10px; }
+.tile { padding: 9px 12px; display: flex; flex-direction: column; }
+.tile span, .tile small { color: var(--soft); font-size: 12.5px; }
+.tile b { font-size: 18px; font-weight: 600; font-variant-numeric: tabular-nums; }
+.figure { padding: 14px 14px 6px; margin: 14px 0; break-inside: avoid; }
+.caption { margin: 2px 0 6px; color: var(--soft); font-size: 14px; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 380px), 1fr)); }
+.plot { width: 100%; min-width: 0; }
+.listings { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 400px), 1fr)); gap: 14px;
+  align-items: start; }
+.listing { padding: 12px 14px; break-inside: avoid; overflow-x: auto; }
+.listing p { margin: 0; color: var(--soft); }
+table { border-collapse: collapse; font-size: 13.5px; font-variant-numeric: tabular-nums; }
+.listing table { width: 100%; }
+th { text-align: left; font-weight: 600; color: var(--soft); white-space: nowrap; }
+th, td { padding: 3px 14px 3px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+tr:last-child td { border-bottom: 0; }
+tr.good td:last-child { color: var(--good); font-weight: 600; }
+tr.bad td:last-child { color: var(--bad); font-weight: 600; }
+@media (max-width: 520px) {
+  main { padding: 14px 8px 32px; }
+  .figure { padding: 12px 6px 4px; }
+  .figure h2, .caption { padding: 0 6px; }
+  .tiles { grid-template-columns: repeat(2, 1fr); gap: 8px; }
+  h1 { font-size: 23px; }
+}
+@media print {
+  @page { margin: 14mm; }
+  body { background: white; font-size: 12px; print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  main { max-width: none; padding: 0; }
+  .tiles { grid-template-columns: repeat(4, 1fr); }
+  .modebar { display: none !important; }
+  .plots { display: flex; }
+  .plots .plot { width: auto; }
+}
+"""
+
+SCRIPT: Final = """
+"use strict";
+const figures = JSON.parse(document.getElementById("figures").textContent);
+const touch = window.matchMedia("(pointer: coarse)").matches;
+const config = { responsive: true, displaylogo: false, modeBarButtons: [["resetScale2d", "toImage"]],
+  displayModeBar: window.matchMedia("(hover: hover)").matches ? "hover" : false };
+for (const figure of figures) {
+  // On a touch screen a finger on a figure scrolls the page.
+  figure.layout.dragmode = touch ? false : "zoom";
+  Plotly.newPlot(figure.key, figure.data, figure.layout, config);
+}
+// Figures do not follow the paper by themselves. A page is 660 pixels wide and holds two figures of this height.
+window.addEventListener("beforeprint", () => {
+  for (const figure of figures) {
+    const plot = document.getElementById(figure.key);
+    const height = Math.min(plot.clientHeight, 370);
+    plot.dataset.height = plot.style.height;
+    plot.style.height = height + "px";
+    Plotly.relayout(plot, { width: plot.parentElement.childElementCount > 1 ? 325 : 660, height });
+  }
+});
+window.addEventListener("afterprint", () => {
+  for (const figure of figures) {
+    const plot = document.getElementById(figure.key);
+    plot.style.height = plot.dataset.height;
+    Plotly.relayout(plot, { width: null, height: null, autosize: true });
+  }
+});
+"""

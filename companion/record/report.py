@@ -1,0 +1,296 @@
+"""`report.html`: a flight on one page that opens offline, on a phone, and in print."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from companion.errors import InputError
+from companion.record.charts import Array
+from companion.record.columns import LIMIT_NAMES, TRACK_PHASE
+from companion.record.figures import FIGURES, FlightData
+from companion.record.flight_record import FlightRecord
+from companion.record.folder import CONFIGURATION_FILE, read_summary, write_whole
+from companion.record.page import PAGE, SCRIPT, STYLE
+from companion.record.summary import PASSED
+
+REPORT_FILE: Final = "report.html"
+TRUTH_FILE: Final = "truth.csv"
+"""Written by the simulated vehicle: what really happened, on the clock of the record's `t_s`."""
+
+
+def build_report(folder: Path) -> Path:
+    """Write `report.html` from what is in a flight's folder and return its path.
+
+    Needs `record.npz` and `summary.json`; uses `flight.toml` (thresholds, limits, gains, mass) and `truth.csv` when
+    they are there.
+
+    Raises:
+        InputError: a file is missing that must be there, or one cannot be read, or the report cannot be written.
+    """
+    record = FlightRecord.load(folder)
+    summary = read_summary(folder)
+    configuration = _read_configuration(folder / CONFIGURATION_FILE)
+    mass_kg = next((value for value in _find(configuration, "mass_kg") if isinstance(value, int | float)), None)
+    flight = FlightData(
+        record=record,
+        summary=summary,
+        truth=_read_truth(folder / TRUTH_FILE),
+        mass_kg=None if mass_kg is None else float(mass_kg),
+        limits=_merged(configuration, "limits"),
+    )
+    page = _page(_name(configuration, folder), flight, configuration)
+    try:
+        return write_whole(folder / REPORT_FILE, page)
+    except OSError as error:
+        raise InputError(
+            f"{folder / REPORT_FILE}: cannot be written ({error.strerror}); copy the folder first"
+        ) from None
+
+
+def _name(configuration: Mapping[str, Any], folder: Path) -> str:
+    """What the flight file calls the flight, or the name of its folder."""
+    flight = configuration.get("flight")
+    for table in (configuration, flight if isinstance(flight, Mapping) else {}):
+        if isinstance(name := table.get("name"), str) and name:
+            return name
+    return folder.resolve().name
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def _read_configuration(path: Path) -> dict[str, Any]:
+    """The configuration as used; empty when there is none."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); repair or remove it") from None
+
+
+def _read_truth(path: Path) -> dict[str, Array]:
+    """The truth by column; empty when there is none. A last line that was cut off is left out."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.reader(file)
+            names = next(reader, [])
+            rows = [[float(value) for value in row] for row in reader if len(row) == len(names) and row[-1]]
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); repair or remove it") from None
+    if "t_s" not in names:
+        raise InputError(f"{path}: the first line must name the columns, t_s among them; repair or remove it")
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+    return {name: table[:, index] for index, name in enumerate(names)}
+
+
+def _find(configuration: Mapping[str, Any], key: str) -> Iterator[Any]:
+    """Every value with this key, however deep: the outer ones first."""
+    if key in configuration:
+        yield configuration[key]
+    for value in configuration.values():
+        if isinstance(value, Mapping):
+            yield from _find(value, key)
+
+
+def _merged(configuration: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """All tables with this name as one; the outer ones win, as a flight file wins over its vehicle's."""
+    merged: dict[str, Any] = {}
+    for table in reversed([found for found in _find(configuration, key) if isinstance(found, Mapping)]):
+        merged.update(table)
+    return merged
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+
+def _page(name: str, flight: FlightData, configuration: Mapping[str, Any]) -> str:
+    from plotly.offline import get_plotlyjs
+
+    figures, sections = _figures(flight)
+    verdict = str(flight.summary.get("verdict", "unknown"))
+    parts = {
+        "TITLE": html.escape(name),
+        "STYLE": STYLE,
+        "SUBTITLE": _subtitle(flight.summary),
+        "VERDICT": html.escape(verdict),
+        "VERDICT_CLASS": "passed" if verdict == PASSED else "missed",
+        "THRESHOLDS": _thresholds(flight.summary, _merged(configuration, "acceptance")),
+        "TILES": _tiles(flight.summary),
+        "FIGURES": sections,
+        "TABLES": _tables(flight, configuration),
+        "PLOTLY": get_plotlyjs(),
+        # "</" would end the script element that holds the data.
+        "DATA": json.dumps(figures, default=_encode_array, allow_nan=False).replace("</", "<\\/"),
+        "SCRIPT": SCRIPT,
+    }
+    # One pass over the template's own marks, so that nothing inside an inserted part is taken for a mark.
+    pieces = PAGE.split("@@")
+    return "".join(parts[piece] if index % 2 else piece for index, piece in enumerate(pieces))
+
+
+def _encode_array(value: object) -> object:
+    """Arrays as plotly.js takes them: base64 of the numbers, which also holds NaN."""
+    if isinstance(value, np.ndarray):
+        return {"dtype": "f4", "bdata": base64.b64encode(value.astype("<f4").tobytes()).decode("ascii")}
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} does not belong into a figure")
+
+
+def _figures(flight: FlightData) -> tuple[list[dict[str, Any]], str]:
+    """What plotly.js draws, by the id of the element, and the sections with these elements."""
+    drawn: list[dict[str, Any]] = []
+    sections = []
+    for figure in FIGURES:
+        panels = [{"key": figure.key, **figure.build(flight)}]
+        if figure.close is not None and (close := figure.close(flight)) is not None:
+            panels.append({"key": f"{figure.key}-close", **close})
+        plots = "".join(
+            f'<div class="plot" id="{panel["key"]}" style="height:{figure.height_px}px"></div>' for panel in panels
+        )
+        sections.append(
+            f'<section class="figure"><h2>{html.escape(figure.title)}</h2>'
+            f'<p class="caption">{html.escape(figure.caption)}</p><div class="plots">{plots}</div></section>\n'
+        )
+        drawn += panels
+    return drawn, "".join(sections)
+
+
+def _subtitle(summary: Mapping[str, Any]) -> str:
+    rate = summary.get("control_rate_hz")
+    words = [
+        f"trajectory <b>{html.escape(str(summary.get('trajectory', '?')))}</b>",
+        f"vehicle <b>{html.escape(str(summary.get('vehicle', '?')))}</b>",
+        f"{_number(summary.get('duration_s'))} s of tracking",
+    ]
+    if rate:
+        words.append(f"{_number(rate)} Hz")
+    return " · ".join(words)
+
+
+def _thresholds(summary: Mapping[str, Any], acceptance: Mapping[str, Any]) -> str:
+    """Each threshold with what was reached."""
+    if not acceptance:
+        return "<p>The flight file sets no thresholds.</p>"
+    rows = []
+    for key, most in acceptance.items():
+        value = summary.get(key)
+        good = isinstance(value, int | float) and value <= most
+        cells = f"<td>{html.escape(key)}</td><td>{_number(value)}</td><td>{_number(most)}</td>"
+        rows.append(f'<tr class="{"good" if good else "bad"}">{cells}<td>{"met" if good else "missed"}</td></tr>')
+    head = "<tr><th>Threshold</th><th>reached</th><th>allowed</th><th></th></tr>"
+    return f'<table class="numbers">{head}{"".join(rows)}</table>'
+
+
+def _tiles(summary: Mapping[str, Any]) -> str:
+    """The summary as a grid of figures."""
+    window = f"from {_number(summary.get('statistics_from_s'))} s to the end"
+    age, step = summary.get("state_age_ms") or {}, summary.get("step_us") or {}
+    disturbance = summary.get("disturbance_m_s2") or []
+    tilt = summary.get("tilt_max_rad")
+    heading = summary.get("heading_rms_rad")
+    tiles = [
+        ("Position error, rms", _length(summary.get("position_rms_m")), window),
+        ("95 % of the time below", _length(summary.get("position_p95_m")), window),
+        ("Largest", _length(summary.get("position_max_m")), window),
+        ("Vertical error, rms", _length(summary.get("vertical_rms_m")), window),
+        ("Settled after", _with(summary.get("settled_at_s"), "s"), "below 0.2 m from then on"),
+        ("Heading error, rms", "free" if heading is None else _with(math.degrees(heading), "°"), window),
+        ("Sideways speed, rms", _length(summary.get("body_sideways_rms_m_s"), "/s"), window),
+        (
+            "Disturbance",
+            ", ".join("–" if value is None else f"{round(value, 2) + 0.0:.2f}" for value in disturbance) or "–",
+            "m/s², north, east, down",
+        ),
+        (
+            "Thrust",
+            f"{_number(summary.get('thrust_min_n'), 3)} – {_number(summary.get('thrust_max_n'), 3)} N",
+            "whole track",
+        ),
+        ("Largest tilt", "–" if tilt is None else _with(math.degrees(tilt), "°"), "whole track"),
+        ("State age", _with(age.get("p50"), "ms"), f"99 %: {_number(age.get('p99'))} ms"),
+        ("Control step", _with(step.get("p50"), "µs"), f"99 %: {_number(step.get('p99'))} µs"),
+        ("Steps", f"{summary.get('steps', 0)}", f"{summary.get('late_steps', 0)} late"),
+        ("Lost setpoints", f"{summary.get('lost_setpoints', 0)}", "states that got no answer"),
+    ]
+    return "".join(_tile(*map(html.escape, tile)) for tile in tiles)
+
+
+def _tile(label: str, value: str, note: str) -> str:
+    return f'<div class="tile"><span>{label}</span><b>{value}</b><small>{note}</small></div>'
+
+
+def _tables(flight: FlightData, configuration: Mapping[str, Any]) -> str:
+    """Phases, limits and gains."""
+    phases = [
+        (entry["name"], _number(None if entry["at_s"] is None else entry["at_s"] - flight.start_s), entry["reason"])
+        for entry in flight.summary.get("phases", [])
+    ]
+    reached = [(LIMIT_NAMES[bit], share) for bit, share in _limit_shares(flight.record)]
+    tables = [
+        _listing("Phases", ("phase", "from, s", "because"), phases),
+        _listing("Limits reached on the track", ("limit", "share of the steps"), reached, empty="None."),
+        _listing("Limits used", ("limit", "value"), _settings(flight.limits)),
+        _listing("Gains used", ("gain", "value"), _settings(_merged(configuration, "controller"))),
+    ]
+    return "".join(tables)
+
+
+def _limit_shares(record: FlightRecord) -> list[tuple[int, str]]:
+    """The limits that acted on the track, and for how much of it."""
+    values = record.column("limits")[record.in_phase(TRACK_PHASE)]
+    bits = np.where(np.isfinite(values), values, 0.0).astype(np.int64)
+    counts = [(bit, int(np.count_nonzero(bits & bit))) for bit in LIMIT_NAMES]
+    return [(bit, f"{100.0 * count / len(bits):.2g} %") for bit, count in counts if count]
+
+
+def _settings(table: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(key, _setting(value)) for key, value in table.items() if not isinstance(value, Mapping)]
+
+
+def _setting(value: object) -> str:
+    if isinstance(value, list):
+        return ", ".join(_setting(item) for item in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _listing(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], empty: str = "") -> str:
+    """A titled table; nothing at all when it has no rows and nothing to say about that."""
+    if not rows and not empty:
+        return ""
+    heads = "".join(f"<th>{html.escape(word)}</th>" for word in head)
+    lines = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    body = f"<table><tr>{heads}</tr>{lines}</table>" if rows else f"<p>{html.escape(empty)}</p>"
+    return f'<section class="listing"><h3>{html.escape(title)}</h3>{body}</section>\n'
+
+
+def _number(value: object, digits: int = 4) -> str:
+    return f"{value:.{digits}g}" if isinstance(value, int | float) else "–"
+
+
+def _with(value: object, unit: str) -> str:
+    if not isinstance(value, int | float):
+        return "–"
+    return f"{_number(value, 3)}{'' if unit == '°' else ' '}{unit}"
+
+
+def _length(value: object, per: str = "") -> str:
+    """A length in the unit that people would use for it."""
+    if not isinstance(value, int | float):
+        return "–"
+    if value < 0.01:
+        return f"{1000.0 * value:.2g} mm{per}"
+    return f"{100.0 * value:.3g} cm{per}" if value < 1.0 else f"{value:.3g} m{per}"

@@ -1,0 +1,1 @@
+"""References: what is to be flown, as functions of time with exact derivatives up to the fourth."""

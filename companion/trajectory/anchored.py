@@ -1,0 +1,177 @@
+"""A trajectory as a file defines it, and the same put in its place in the autopilot's local frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import cos, hypot, sin
+from typing import Literal
+
+from companion.control.types import Reference, Vec3
+from companion.errors import RefusedError
+from companion.trajectory.shapes import ZERO, Joint, Shape
+from companion.trajectory.timing import paced, run_out, run_out_duration_s, scaled
+
+Anchor = Literal["here", "local", "home"]
+JoinKind = Literal["smooth", "law"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trajectory:
+    """A shape with its pace, its duration and where it belongs; in the coordinates of its definition."""
+
+    name: str
+    shape: Shape
+    duration_s: float
+    """Time of flight [s], at the pace of `time_scale`."""
+    anchor: Anchor = "here"
+    anchor_yaw_rad: float = 0.0
+    """Rotates the trajectory about its anchor, clockwise seen from above."""
+    join: JoinKind = "smooth"
+    time_scale: float = 1.0
+    """2.0 plays the shape twice as fast."""
+
+    @property
+    def period_s(self) -> float | None:
+        """Time of one lap [s]; None for an open shape."""
+        period_s = self.shape.period_s
+        return None if period_s is None else period_s / self.time_scale
+
+    def at(self, t_s: float) -> Reference:
+        """Return the reference at a time since the start [s]; the shape goes on outside of [0, duration_s]."""
+        if self.time_scale == 1.0:
+            return self.shape.at(t_s)
+        return scaled(self.shape.at(self.time_scale * t_s), self.time_scale)
+
+    def joints(self) -> tuple[Joint, ...]:
+        """Where pieces of the shape meet within the duration, with the exact values on either side."""
+        k = self.time_scale
+        return tuple(
+            Joint(at_s / k, scaled(before, k), scaled(after, k))
+            for at_s, before, after in self.shape.joints()
+            if at_s / k <= self.duration_s
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchored:
+    """A trajectory in the autopilot's local frame (NED): rotated about the vertical, then moved.
+
+    Outside of [0, duration_s] it neither stops dead nor flies on for ever: it runs out to rest along its own path (and,
+    before 0, comes from rest along it), continuous up to the fourth derivative. So a loop that asks a little ahead, for
+    the time at which a setpoint takes effect, gets the true continuation; one that forgets to end the flight gets a
+    point to hold. Running out adds at most `RUN_OUT_ACCELERATION_M_S2` along the path and is a safety net: a planned
+    end is `joins.stop`, which keeps the limits.
+    """
+
+    trajectory: Trajectory
+    offset_m: Vec3
+    """Added after the rotation."""
+    cos_yaw: float
+    sin_yaw: float
+    yaw_rad: float
+    run_up_s: float
+    """Over which it comes from rest before 0 [s]."""
+    run_out_s: float
+    """Over which it comes to rest after the end [s]."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time of flight [s]."""
+        return self.trajectory.duration_s
+
+    @property
+    def period_s(self) -> float | None:
+        """Time of one lap [s]; None for an open shape."""
+        return self.trajectory.period_s
+
+    @property
+    def time_scale(self) -> float:
+        """The pace of the trajectory."""
+        return self.trajectory.time_scale
+
+    def at(self, t_s: float) -> Reference:
+        """Return the reference at a time since the start [s], any time."""
+        trajectory = self.trajectory
+        if t_s > trajectory.duration_s:
+            pace = run_out(t_s - trajectory.duration_s, self.run_out_s)
+            return self._placed(paced(trajectory.at(trajectory.duration_s + pace[0]), pace))
+        if t_s < 0.0:
+            # The run-out mirrored in time: odd derivatives of the path's time keep their sign, even ones change it.
+            f0, f1, f2, f3, f4 = run_out(-t_s, self.run_up_s)
+            return self._placed(paced(trajectory.at(-f0), (-f0, f1, -f2, f3, -f4)))
+        return self._placed(trajectory.at(t_s))
+
+    def joints(self) -> tuple[Joint, ...]:
+        """Where pieces of the trajectory meet, with the exact values on either side."""
+        joints = self.trajectory.joints()
+        return tuple(Joint(at_s, self._placed(before), self._placed(after)) for at_s, before, after in joints)
+
+    def shifted(self, delta_m: Vec3) -> Anchored:
+        """Return the same moved by `delta_m` (NED): after the estimator has reset its position by as much."""
+        x, y, z = self.offset_m
+        return replace(self, offset_m=(x + delta_m[0], y + delta_m[1], z + delta_m[2]))
+
+    def ending_at(self, t_s: float) -> Anchored:
+        """Return the same with its end at `t_s`: from then on it runs out to rest along its path. For a stop at
+        once."""
+        trajectory = replace(self.trajectory, duration_s=t_s)
+        return replace(self, trajectory=trajectory, run_out_s=run_out_duration_s(hypot(*trajectory.at(t_s).v)))
+
+    def _placed(self, r: Reference) -> Reference:
+        x, y, z = self.offset_m
+        if self.yaw_rad == 0.0:
+            p = (r.p[0] + x, r.p[1] + y, r.p[2] + z)
+            return Reference(p, r.v, r.a, r.j, r.s, r.yaw, r.yaw_rate, r.yaw_acceleration)
+        c, s = self.cos_yaw, self.sin_yaw
+        p = _rotated(c, s, r.p)
+        return Reference(
+            (p[0] + x, p[1] + y, p[2] + z),
+            _rotated(c, s, r.v),
+            _rotated(c, s, r.a),
+            _rotated(c, s, r.j),
+            _rotated(c, s, r.s),
+            r.yaw + self.yaw_rad,
+            r.yaw_rate,
+            r.yaw_acceleration,
+        )
+
+
+def anchored(trajectory: Trajectory, hold_point: Vec3, home_point: Vec3 | None) -> Anchored:
+    """Put a trajectory in its place in the autopilot's local frame (NED, metres).
+
+    "here": its start p_d(0) is at `hold_point`, and the yaw offset turns it about that point. "local": its coordinates
+    are the local frame's, turned about the origin. "home": its coordinates are relative to `home_point` (HOME_POSITION
+    x, y, z), turned about it.
+
+    Raises:
+        RefusedError: the anchor is "home" and the home position is not known (None).
+
+    """
+    yaw_rad = trajectory.anchor_yaw_rad
+    c, s = cos(yaw_rad), sin(yaw_rad)
+    if trajectory.anchor == "here":
+        start = _rotated(c, s, trajectory.at(0.0).p)
+        offset_m = (hold_point[0] - start[0], hold_point[1] - start[1], hold_point[2] - start[2])
+    elif trajectory.anchor == "home":
+        if home_point is None:
+            raise RefusedError(
+                f'trajectory {trajectory.name}: anchor = "home", but the vehicle has not told its home position; '
+                'wait until it has one, or use anchor = "here"'
+            )
+        offset_m = home_point
+    else:
+        offset_m = ZERO
+    return Anchored(
+        trajectory=trajectory,
+        offset_m=offset_m,
+        cos_yaw=c,
+        sin_yaw=s,
+        yaw_rad=yaw_rad,
+        run_up_s=run_out_duration_s(hypot(*trajectory.at(0.0).v)),
+        run_out_s=run_out_duration_s(hypot(*trajectory.at(trajectory.duration_s).v)),
+    )
+
+
+def _rotated(c: float, s: float, vector: Vec3) -> Vec3:
+    """Rotate about the vertical (down) axis, north to east."""
+    return c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2]

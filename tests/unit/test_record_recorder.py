@@ -1,0 +1,181 @@
+"""The recorder process: nothing blocks, nothing is lost that was taken, and nothing that ends a command ends it."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink2
+
+from companion.errors import InputError
+from companion.record.recorder import Recorder, _DiskWriter
+from companion.record.tlog import Direction, encode_datagram, read_tlog
+
+PATIENCE_S = 30.0
+
+
+def frame(sequence: int = 0) -> bytes:
+    link = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
+    link.seq = sequence % 256
+    return mavlink2.MAVLink_heartbeat_message(2, 12, 81, 0, 4, 3).pack(link)
+
+
+def until(condition: Callable[[], bool]) -> bool:
+    """Wait for a condition, long enough for a busy machine."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+@pytest.fixture
+def recorder(tmp_path) -> Iterator[Recorder]:
+    recorder = Recorder.start(tmp_path)
+    yield recorder
+    with contextlib.suppress(ProcessLookupError):
+        recorder._process.send_signal(signal.SIGCONT)
+    recorder.close()
+
+
+def test_everything_offered_is_in_the_log(tmp_path, recorder):
+    wall_ns, epoch_ns = time.monotonic_ns(), time.time_ns()
+    for index in range(200):
+        direction = Direction.OUT if index % 2 else Direction.IN
+        recorder.offer(direction, frame(index), wall_ns + index * 4_000_000)
+    recorder.close()
+    assert (recorder.recorded, recorder.dropped, recorder.problem) == (200, 0, None)
+    entries = list(read_tlog(tmp_path / "link.tlog"))
+    assert [entry.raw for entry in entries] == [frame(index) for index in range(200)]
+    assert [entry.direction for entry in entries[:2]] == [Direction.IN, Direction.OUT]
+    # Two readings of two clocks lie between: milliseconds on a busy machine, not seconds.
+    assert entries[0].epoch_us == pytest.approx(epoch_ns / 1000, abs=2e6)
+    assert entries[199].epoch_us - entries[0].epoch_us == pytest.approx(199 * 4000, abs=8)
+    log = mavutil.mavlink_connection(str(tmp_path / "link.tlog"))
+    assert log.recv_match().get_type() == "HEARTBEAT"
+    log.close()
+
+
+def test_entries_reach_the_file_during_the_flight(tmp_path, recorder):
+    recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    assert until(lambda: len(list(read_tlog(tmp_path / "link.tlog"))) == 1)
+
+
+def test_signals_that_end_a_command_do_not_end_the_recorder(tmp_path, recorder):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        recorder._process.send_signal(number)
+    assert os.getpgid(recorder._process.pid) != os.getpgid(0)
+    recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    recorder.close()
+    assert (recorder.recorded, recorder.problem) == (1, None)
+
+
+def test_a_full_buffer_drops_and_counts_instead_of_blocking(tmp_path, recorder):
+    recorder._process.send_signal(signal.SIGSTOP)
+    raw = frame() * 50
+    offered = 0
+    while recorder.dropped < 10 and offered < 100_000:
+        recorder.offer(Direction.IN, raw, time.monotonic_ns())
+        offered += 1
+    assert recorder.dropped == 10
+    recorder._process.send_signal(signal.SIGCONT)
+    recorder.close()
+    assert recorder.recorded == offered - 10
+    assert len(list(read_tlog(tmp_path / "link.tlog"))) == 50 * (offered - 10)
+    assert recorder.problem is not None
+    assert "10 datagrams are missing" in recorder.problem
+
+
+def test_a_recorder_that_dies_does_not_disturb_the_flight(recorder):
+    recorder._process.kill()
+    recorder._process.wait()
+    for _ in range(5):
+        recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    recorder.close()
+    assert recorder.dropped == 5
+    assert recorder.problem is not None
+    assert "incomplete" in recorder.problem
+    recorder.offer(Direction.IN, frame(), 0)
+    assert recorder.dropped == 6
+
+
+def test_the_child_holds_no_socket_but_its_own(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind(("127.0.0.1", 0))
+        vehicle.set_inheritable(True)
+        recorder = Recorder.start(tmp_path)
+        try:
+            opened = [os.readlink(entry) for entry in Path(f"/proc/{recorder._process.pid}/fd").iterdir()]
+            assert sum(name.startswith("socket:") for name in opened) == 1
+            assert os.readlink(f"/proc/self/fd/{vehicle.fileno()}") not in opened
+            assert os.getpriority(os.PRIO_PROCESS, recorder._process.pid) > os.getpriority(os.PRIO_PROCESS, 0)
+        finally:
+            recorder.close()
+
+
+CONTROL = """
+import sys, time
+from pathlib import Path
+from companion.record.recorder import Recorder
+recorder = Recorder.start(Path(sys.argv[1]))
+raw = bytes.fromhex(sys.argv[2])
+for index in range(300):
+    recorder.offer(0, raw, time.monotonic_ns())
+print(recorder._process.pid, flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_log_survives_the_death_of_the_control_process(tmp_path):
+    command = [sys.executable, "-c", CONTROL, str(tmp_path), frame().hex()]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as control:
+        assert control.stdout is not None
+        child = int(control.stdout.readline())
+        control.send_signal(signal.SIGKILL)
+    assert until(lambda: _ended(child))
+    assert [entry.raw for entry in read_tlog(tmp_path / "link.tlog")] == [frame()] * 300
+
+
+def _ended(pid: int) -> bool:
+    """Gone, or dead and not yet collected by whoever adopted it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def test_a_log_is_never_overwritten(tmp_path):
+    (tmp_path / "link.tlog").write_bytes(b"another flight")
+    with pytest.raises(InputError, match=r"link\.tlog: cannot be created \(File exists\)"):
+        Recorder.start(tmp_path)
+    assert (tmp_path / "link.tlog").read_bytes() == b"another flight"
+    with pytest.raises(InputError, match="No such file or directory"):
+        Recorder.start(tmp_path / "missing")
+
+
+def test_a_full_disk_is_said_once_and_ends_the_writing(capfd):
+    full = os.open("/dev/full", os.O_WRONLY)
+    writer = _DiskWriter(full)
+    entry = encode_datagram(frame(), 4, Direction.IN)
+    assert writer.put(entry)
+    assert until(lambda: writer.error is not None)
+    assert not writer.put(entry)
+    writer.close()
+    os.close(full)
+    assert capfd.readouterr().err == "link.tlog: No space left on device; no more traffic is recorded\n"
+
+
+def test_started_by_hand_it_explains_itself():
+    done = subprocess.run(
+        [sys.executable, "-m", "companion.record.recorder"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert "started by `companion`" in done.stderr

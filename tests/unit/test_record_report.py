@@ -1,0 +1,238 @@
+"""The report: the figures are there and true, it opens offline, and it copes with what may be missing."""
+
+import base64
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from record_cases import DISTURBANCE, MASS_KG, PHASES, synthetic_flight, write_truth
+
+from companion.errors import InputError
+from companion.record.charts import thin
+from companion.record.figures import FIGURES
+from companion.record.flight_record import FlightRecord
+from companion.record.folder import write_configuration, write_summary
+from companion.record.report import build_report
+from companion.record.summary import FlightMeta, PhaseChange, summarise
+
+CONFIGURATION = {
+    "name": "paper <in> wind",
+    "acceptance": {"position_rms_m": 0.01, "position_max_m": 0.001},
+    "vehicle": {
+        "body": {"mass_kg": MASS_KG},
+        "limits": {"thrust_min_n": 9.0, "thrust_max_n": 80.0, "rate_max_rad_s": [6.0, 6.0, 3.0]},
+        "controller": {"k1_1_s": 0.7, "k2": 4.0},
+    },
+    "limits": {"thrust_max_n": 70.0},
+}
+ALL = ["position-error", "plan-view", "plan-view-close", "body-velocities", "force-estimates", "errors", "actuation"]
+
+
+class Page(HTMLParser):
+    """What a browser would see: elements, their attributes, the scripts' text, and the visible text."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.scripts: list[str] = []
+        self.text = ""
+        self._inside = ""
+        self.feed(path.read_text(encoding="utf-8"))
+        self.figures = {figure["key"]: figure for figure in json.loads(self.scripts[1])}
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        self._inside = tag
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag):
+        self._inside = ""
+
+    def handle_data(self, data):
+        if self._inside == "script":
+            self.scripts[-1] += data
+        elif self._inside != "style":
+            self.text += data + " "
+
+    def trace(self, key: str, name: str, axis: str = "y") -> tuple[np.ndarray, np.ndarray]:
+        found = [
+            trace for trace in self.figures[key]["data"] if trace["name"] == name and trace.get("yaxis", "y") == axis
+        ]
+        assert len(found) == 1
+        return tuple(np.frombuffer(base64.b64decode(found[0][name]["bdata"]), dtype="<f4") for name in "xy")
+
+
+@pytest.fixture(scope="module")
+def record() -> FlightRecord:
+    return synthetic_flight()
+
+
+def fill(folder: Path, record: FlightRecord, phases=PHASES) -> Path:
+    record.save(folder)
+    meta = FlightMeta("paper", "quad", acceptance=CONFIGURATION["acceptance"])
+    write_summary(folder, summarise(record, phases, meta))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory, record) -> Page:
+    folder = fill(tmp_path_factory.mktemp("flight"), record)
+    write_configuration(folder, CONFIGURATION)
+    write_truth(folder / "truth.csv")
+    path = build_report(folder)
+    assert path == folder / "report.html"
+    assert path.stat().st_size < 8_000_000
+    return Page(path)
+
+
+def test_nothing_is_loaded_from_anywhere(page):
+    assert all("src" not in attributes and "href" not in attributes for _, attributes in page.elements)
+    assert not {"link", "img", "iframe", "object", "embed", "base"} & {tag for tag, _ in page.elements}
+    policies = [
+        attributes["content"]
+        for tag, attributes in page.elements
+        if tag == "meta" and attributes.get("http-equiv") == "Content-Security-Policy"
+    ]
+    assert len(policies) == 1
+    assert policies[0].startswith("default-src 'none';")
+    assert "http" not in policies[0]
+    assert len(page.scripts) == 3
+    assert sum("plotly.js v" in script for script in page.scripts) == 1
+
+
+def test_every_figure_has_its_place_and_plotly_accepts_it(page):
+    places = [attributes["id"] for tag, attributes in page.elements if tag == "div" and "id" in attributes]
+    assert places == list(page.figures) == ALL
+    for figure in page.figures.values():
+        go.Figure(data=figure["data"], layout=figure["layout"])  # raises for what plotly.js would not know
+
+
+def test_every_axis_says_its_unit(page):
+    for figure in page.figures.values():
+        axes = [value for key, value in figure["layout"].items() if key.startswith(("xaxis", "yaxis"))]
+        assert len(axes) >= 2
+        assert all(axis["title"]["text"].endswith("]") for axis in axes)
+
+
+def test_titles_captions_and_numbers_are_on_the_page(page, record):
+    for figure in FIGURES:
+        assert figure.title in page.text
+        assert figure.caption in page.text
+    assert "paper <in> wind" in page.text
+    assert "missed: position_max_m" in page.text
+    assert "thrust at its maximum" in page.text
+    for change in PHASES:
+        assert change.reason in page.text
+    for key, value in (("rate_max_rad_s", "6, 6, 3"), ("thrust_max_n", "70"), ("thrust_min_n", "9"), ("k2", "4")):
+        assert f"{key} {value}" in " ".join(page.text.split())
+
+
+def test_the_plan_shows_the_path_with_north_up(page, record):
+    east, north = page.trace("plan-view", "flown")
+    assert north.max() == pytest.approx(record.column("p_n").max(), rel=1e-6)
+    assert east.min() == pytest.approx(record.column("p_e").min(), rel=1e-6)
+    start_east, start_north = page.trace("plan-view", "start")
+    assert (start_north[0], start_east[0]) == pytest.approx((record.column("p_n")[0], record.column("p_e")[0]))
+    layout = page.figures["plan-view"]["layout"]
+    assert (layout["yaxis"]["scaleanchor"], layout["yaxis"]["scaleratio"]) == ("x", 1)
+    low, high = page.figures["plan-view-close"]["layout"]["yaxis"]["range"]
+    assert -12.0 < low < -10.0 < 0.0 < high < 2.0
+
+
+def test_forces_are_newtons_against_the_truth(page):
+    time_s, truth = page.trace("force-estimates", "truth")
+    assert truth[0] == pytest.approx(MASS_KG * DISTURBANCE[0], rel=1e-6)
+    assert time_s[0] == pytest.approx(-3.0, abs=1e-4)
+    _, estimate = page.trace("force-estimates", "estimate", "y3")
+    assert estimate[-1] == pytest.approx(MASS_KG * DISTURBANCE[2], abs=0.2)
+    assert page.figures["force-estimates"]["layout"]["yaxis3"]["title"]["text"] == "Down [N]"
+
+
+def test_thinning_keeps_the_peaks_of_the_flight(page, record):
+    for name, column in (("|e₁|", "e1"), ("|e₄|", "e4")):
+        size = np.linalg.norm(record.columns(f"{column}_n", f"{column}_e", f"{column}_d"), axis=1)
+        assert np.nanmax(page.trace("errors", name)[1]) == pytest.approx(np.nanmax(size), rel=1e-6)
+    _, thrust = page.trace("actuation", "thrust")
+    assert thrust.min() == pytest.approx(record.column("thrust_n").min(), rel=1e-6)
+    assert len(thrust) < len(record) / 2
+
+
+def test_phases_are_marked_in_time_figures(page):
+    layout = page.figures["body-velocities"]["layout"]
+    shaded = [(shape["x0"], shape["x1"]) for shape in layout["shapes"] if shape["type"] == "rect"]
+    assert shaded == [pytest.approx((-3.0, 0.0)), pytest.approx((60.0, 65.0), abs=0.01)]
+    assert [note["text"] for note in layout["annotations"]] == ["track"]
+    assert "OFFBOARD confirmed" in layout["annotations"][0]["hovertext"]
+
+
+def test_thin_keeps_spikes_ends_and_gaps():
+    series = np.zeros((100_000, 2))
+    series[43_210, 0], series[77_777, 1] = 5.0, -3.0
+    series[50_000:50_010, 1] = np.nan
+    rows = thin(series, 100)
+    assert len(rows) < 500
+    assert {0, 43_210, 49_999, 50_000, 50_009, 50_010, 77_777, 99_999} <= set(rows.tolist())
+    assert thin(series[:50], 100).tolist() == list(range(50))
+
+
+def test_without_truth_and_configuration(tmp_path, record):
+    page = Page(build_report(fill(tmp_path, record.select(np.arange(0, len(record), 10)))))
+    assert list(page.figures) == ALL
+    names = [trace["name"] for trace in page.figures["force-estimates"]["data"]]
+    assert names == ["estimate"] * 3
+    assert page.figures["force-estimates"]["layout"]["yaxis"]["title"]["text"] == "North [m/s²]"
+    assert tmp_path.name in page.text
+
+
+@pytest.mark.parametrize("rows", [[], [0], list(range(100))])
+def test_a_flight_that_never_tracked(tmp_path, record, rows):
+    page = Page(build_report(fill(tmp_path, record.select(np.array(rows, dtype=np.intp)))))
+    assert "did not track" in page.text
+    assert list(page.figures) == [key for key in ALL if key != "plan-view-close"]
+    for figure in page.figures.values():
+        go.Figure(data=figure["data"], layout=figure["layout"])
+
+
+def test_text_from_outside_stays_text(tmp_path, record):
+    nasty = '</script><script src="x">@@DATA@@&'
+    write_configuration(tmp_path, {"name": nasty})
+    page = Page(build_report(fill(tmp_path, record, [PhaseChange("track", 104.0, nasty)])))
+    assert len(page.scripts) == 3
+    assert page.text.count(nasty) == 3  # title, heading, and the phases' table
+    assert nasty in page.figures["errors"]["layout"]["annotations"][0]["hovertext"]
+
+
+def test_a_truth_that_was_cut_off_is_used_up_to_there(tmp_path, record):
+    write_truth(tmp_path / "truth.csv")
+    whole = (tmp_path / "truth.csv").read_text()
+    (tmp_path / "truth.csv").write_text(whole[: whole.rindex(",") - 3])
+    page = Page(build_report(fill(tmp_path, record)))
+    assert len(page.trace("force-estimates", "truth")[0]) > 2
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("truth.csv", "time,p_n\n1,2\n", "t_s among them"),
+        ("truth.csv", "t_s,p_n\n1,two\n", "cannot be read"),
+        ("flight.toml", "name = ", "cannot be read"),
+        ("summary.json", "{", "not a summary"),
+        ("record.npz", "PK", "not a flight record"),
+    ],
+)
+def test_broken_files_are_refused_by_name(tmp_path, record, name, text, message):
+    fill(tmp_path, record.select(np.arange(100)))
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        build_report(tmp_path)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_without_a_flight_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no flight record"):
+        build_report(tmp_path)
