@@ -59,11 +59,11 @@ class Rotors(Section):
 class Autopilot(Section):
     """[autopilot]: its loops, as seen from their setpoints."""
 
-    rate_lag_s: NotNegativeVector
-    rate_integral_1_s: NotNegativeVector = (0.0, 0.0, 0.0)
+    rate_lag_s: PositiveVector
+    rate_integral_1_s: NotNegativeVector
     attitude_gain_1_s: PositiveVector
-    attitude_lag_s: NotNegative = 0.0
-    loop_rate_hz: Positive = 500.0
+    attitude_lag_s: NotNegative
+    loop_rate_hz: Positive
 
 
 class Link(Section):
@@ -236,7 +236,7 @@ class Flight(Section):
 
     name: str
     vehicle: Vehicle
-    trajectory: str
+    trajectory: str | dict[str, Any]
     start: Start | None = None
     world: SimulatedWorld = SimulatedWorld()
     output: Output = Output()
@@ -250,6 +250,9 @@ def bundled_root() -> Path:
     """The folder of the bundled configuration: `config/` of a checkout, `companion/_config` of an installed wheel."""
     installed = Path(__file__).parent / "_config"
     return installed if installed.is_dir() else Path(__file__).parent.parent / "config"
+
+
+_SINGULAR = {"vehicles": "vehicle", "trajectories": "trajectory", "flights": "flight"}
 
 
 def find(name: str, kind: str) -> Path:
@@ -273,7 +276,7 @@ def find(name: str, kind: str) -> Path:
     if "/" not in name and bundled.is_file():
         return bundled
     known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-    raise InputError(f"no {kind.rstrip('s')} file {name!r}: neither a path nor one of the bundled ones ({known})")
+    raise InputError(f"no {_SINGULAR[kind]} file {name!r}: neither a path nor one of the bundled ones ({known})")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

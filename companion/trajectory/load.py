@@ -7,7 +7,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from companion.config import find, read_toml, validate
+from companion.config import Flight, find, read_toml, validate
 from companion.errors import InputError
 from companion.frames import radians
 from companion.trajectory.anchored import Trajectory
@@ -60,3 +60,29 @@ def build(data: Mapping[str, Any], name: str, source: str, time_scale: float | N
         join=definition.join,
         time_scale=scale,
     )
+
+
+def of_flight(flight: Flight) -> Trajectory:
+    """Return the trajectory that a flight names, or that stands in its file as a table."""
+    if isinstance(flight.trajectory, str):
+        return load(flight.trajectory)
+    data = dict(flight.trajectory)
+    name = str(data.pop("name", "unnamed"))
+    return build(data, name, f"flight {flight.name!r}: trajectory {name!r}")
+
+
+def embedded(flight: Flight, time_scale: float | None = None) -> Flight:
+    """Return the flight with its trajectory as a table, so that its file says all that was flown.
+
+    Args:
+        flight: names a trajectory, or holds one.
+        time_scale: replaces the trajectory's own.
+    """
+    if isinstance(flight.trajectory, str):
+        path = find(flight.trajectory, "trajectories")
+        table = {"name": path.stem, **read_toml(path)}
+    else:
+        table = dict(flight.trajectory)
+    if time_scale is not None:
+        table["time_scale"] = time_scale
+    return flight.model_copy(update={"trajectory": table})

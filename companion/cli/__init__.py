@@ -1,0 +1,114 @@
+"""The command line: one module per command, imported only when that command is called.
+
+`main` turns the errors of companion.errors into one line and an exit code; anything else is a fault of the program
+(70).
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import sys
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from companion import __version__
+from companion.errors import CompanionError, ExitCode
+
+COMMANDS = {
+    "demo": "Fly the paper's figure of eight on the bundled vehicle.",
+    "fly": "Fly a trajectory on a vehicle that is already there.",
+    "simulate": "Compute a flight without sockets, for a quick look at gains.",
+    "certify": "Check a gain set: certificate, margins, predicted extremes.",
+    "report": "Build report.html of a flight folder again.",
+}
+"""Every command with its line in `companion --help`; the module companion.cli.NAME holds it."""
+
+
+class LazyGroup(TyperGroup):
+    """Knows the commands by name and imports the one that is asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """All commands, in the order of COMMANDS."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of that name, or None; for the overview only its line of help."""
+        if cmd_name not in COMMANDS:
+            return None
+        if _only_help():
+            return typer.core.TyperCommand(name=cmd_name, help=COMMANDS[cmd_name])
+        module = importlib.import_module(f"companion.cli.{cmd_name}")
+        single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+        single.command(name=cmd_name, help=COMMANDS[cmd_name] + "\n\n" + (module.__doc__ or ""), epilog=module.EXAMPLE)(
+            _interruptible(module.run)
+        )
+        command = typer.main.get_command(single)
+        command.name = cmd_name
+        return command
+
+
+def _only_help() -> bool:
+    return len(sys.argv) < 2 or sys.argv[1] in {"--help", "-h"}
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"companion {__version__}")
+        raise typer.Exit
+
+
+app = typer.Typer(
+    cls=LazyGroup,
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["--help", "-h"]},
+    epilog="Start with: companion demo",
+)
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(False, "--version", callback=_show_version, is_eager=True, help="Print the version."),
+) -> None:
+    """Flies a PX4 multirotor along a trajectory, with a disturbance estimator and a proof behind it."""
+
+
+def _interruptible(run: Callable[..., Any]) -> Callable[..., Any]:
+    """The command with Ctrl-C as exit code 130."""
+
+    @functools.wraps(run)
+    def guarded(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return run(*args, **kwargs)
+        except KeyboardInterrupt:
+            raise typer.Exit(int(ExitCode.INTERRUPTED)) from None
+
+    return guarded
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs a command line and returns its exit code (companion.errors.ExitCode)."""
+    try:
+        typer.main.get_command(app).main(args=arguments, prog_name="companion")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(ExitCode.DONE)
+    except CompanionError as error:
+        print(f"companion: {error}", file=sys.stderr)
+        return int(error.exit_code)
+    except Exception:
+        traceback.print_exc()
+        print("companion: this is a fault of the program; please report it with the lines above", file=sys.stderr)
+        return int(ExitCode.INTERNAL)
+    return int(ExitCode.DONE)
+
+
+def entry() -> None:
+    """The `companion` script."""
+    sys.exit(main())

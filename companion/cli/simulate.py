@@ -1,0 +1,73 @@
+"""The law that flies against the physics of the bundled vehicle, in this process. The flight file needs [start]."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.common import (
+    EngineOption,
+    JsonOption,
+    TimeScaleOption,
+    adjustments,
+    print_summary,
+    say,
+    vehicle_changes,
+)
+
+EXAMPLE = "Example: companion simulate paper --ideal --csv paper.csv"
+
+
+def run(
+    flight: Annotated[str, typer.Argument(help="Flight file, or the name of a bundled one.")] = "paper",
+    ideal: Annotated[
+        bool, typer.Option("--ideal", help="The paper's setting: perfect state, law inside the integrator, no limits.")
+    ] = False,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per control step.")] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", help="Another vehicle file for this flight.")] = None,
+    time_scale: TimeScaleOption = None,
+    allow_uncertified: Annotated[
+        bool, typer.Option("--allow-uncertified", help="Try gains that no flight would be allowed with.")
+    ] = False,
+    engine: EngineOption = "auto",
+    as_json: JsonOption = False,
+) -> None:
+    """Computes the flight and prints its summary."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from companion.campaign.simulate import fly_ideal, fly_sampled, write_csv
+    from companion.config import load_flight
+    from companion.flight.preflight import gate_gains, gate_reference
+    from companion.flight.tracker import kernels
+    from companion.trajectory.load import embedded, of_flight
+
+    configured = embedded(load_flight(flight, adjustments(**vehicle_changes(vehicle))), time_scale)
+    trajectory = of_flight(configured)
+    gate_gains(configured.vehicle, allow_uncertified=allow_uncertified)
+    gate_reference(trajectory, configured.vehicle)
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("simulating", total=1.0)
+
+        def progress(share: float) -> None:
+            bar.update(task, completed=share)
+
+        if ideal:
+            trace = fly_ideal(configured, trajectory, progress)
+        else:
+            trace = fly_sampled(configured, trajectory, kernels(engine), progress)
+    if csv is not None:
+        write_csv(trace, csv)
+    if as_json:
+        print(json.dumps(trace.summary, indent=2))
+        return
+    setting = "the paper's ideal setting" if ideal else "sampled, with the vehicle file's lags, delay and noise"
+    say(f"{configured.name}: {trajectory.name} on {configured.vehicle.name}, {setting}")
+    print_summary(trace.summary)
+    truth = ", ".join(f"{x:.3f}" for x in trace.truth_disturbance_m_s2)
+    say(f"  {'true disturbance':32s} ({truth}) m/s^2")
+    if csv is not None:
+        say(f"wrote {len(trace.rows)} rows to {csv}")

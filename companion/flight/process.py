@@ -1,0 +1,132 @@
+"""The control process: everything between a validated flight folder and its record, in a process of its own.
+
+`fly` (the ground side: command line, display) starts it with `python -m companion.flight.process`, hands it a flight
+folder that holds `flight.toml`, and reads status datagrams from a Unix socket pair. The control process owns the
+vehicle link; if the ground side dies, the flight goes on and its results are written all the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+from companion.config import build_flight, read_toml
+from companion.errors import CompanionError, ExitCode
+from companion.flight.loop import FlightLoop, Progress
+from companion.flight.phases import PHASE_NAMES, Cause, Outcome
+from companion.flight.preflight import gate_gains
+from companion.flight.tracker import Tracker, kernels
+from companion.link.wire import Wire
+from companion.record.flight_record import FlightRecord
+from companion.record.folder import CONFIGURATION_FILE, write_summary
+from companion.record.recorder import Recorder
+from companion.record.summary import FlightMeta, summarise
+from companion.trajectory.load import of_flight
+
+MARGIN_S = 120.0
+"""Time that the record has room for beside the trajectory: join, stop, handing over."""
+
+
+class Status:
+    """Sends what the ground side may show; never blocks, and does not mind when nobody listens."""
+
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
+        channel.setblocking(False)
+
+    def send(self, **content: Any) -> None:
+        """One JSON datagram."""
+        with contextlib.suppress(OSError):
+            self._channel.send(json.dumps(content).encode())
+
+    def line(self, text: str) -> None:
+        """A line for people."""
+        self.send(line=text)
+
+    def progress(self, progress: Progress) -> None:
+        """How far the flight is."""
+        self.send(progress=progress._asdict())
+
+
+def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: Status) -> int:
+    """Flies the flight of a folder and writes record and summary into it. Returns the exit code."""
+    path = folder / CONFIGURATION_FILE
+    flight = build_flight(read_toml(path), str(path))
+    trajectory = of_flight(flight)
+    gate_gains(flight.vehicle)
+    compiled = kernels(engine)
+    _warm_up(flight, compiled)
+    status.line(f"engine: {compiled.engine}")
+    capacity = int((trajectory.duration_s + MARGIN_S) * flight.vehicle.link.state_rate_hz * 1.1)
+    record = FlightRecord(capacity, PHASE_NAMES)
+    recorder = Recorder.start(folder)
+    try:
+        with Wire.open(connection, tap=recorder.offer) as wire:
+            loop = FlightLoop(
+                flight, trajectory, wire, record, compiled, status.line, status.progress, connect_timeout_s=timeout_s
+            )
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, lambda *_: loop.interrupt())
+            status.send(ready=True)
+            outcome = loop.run()
+    finally:
+        recorder.close()
+    if recorder.problem:
+        status.line(recorder.problem)
+    return _finish(folder, flight, trajectory, record, outcome, status)
+
+
+def _warm_up(flight: Any, compiled: Any) -> None:
+    """Compiles or loads what a control step needs, before anything connects: nothing is compiled in the air."""
+    from companion.control.types import State
+    from companion.flight.course import at_rest
+
+    tracker = Tracker(flight.vehicle, flight.output.kind, compiled)
+    zero = (0.0, 0.0, 0.0)
+    state = State(zero, zero, (1.0, 0.0, 0.0, 0.0), zero)
+    tracker.begin(state)
+    for i in range(3):
+        tracker.step(1.0 + i / flight.vehicle.link.state_rate_hz, state, lambda t: at_rest(zero, 0.0))
+
+
+def _finish(folder: Path, flight: Any, trajectory: Any, record: FlightRecord, outcome: Outcome, status: Status) -> int:
+    code = int(outcome.cause.value.exit_code)
+    if outcome.phases:
+        meta = FlightMeta(
+            trajectory.name,
+            flight.vehicle.name,
+            outcome.lost_setpoints,
+            flight.statistics_from_s,
+            flight.acceptance.thresholds(),
+        )
+        summary = summarise(record, outcome.phases, meta)
+        summary["ended"] = outcome.sentence
+        summary["rejected_states"] = outcome.rejected_states
+        if outcome.cause is not Cause.COMPLETED:
+            summary["verdict"] = f"ended early: {outcome.sentence}"
+        elif summary["verdict"] != "passed":
+            code = int(ExitCode.MISSED)
+        record.save(folder)
+        write_summary(folder, summary)
+    status.send(outcome=outcome.sentence, cause=outcome.cause.name)
+    return code
+
+
+def main() -> int:
+    """Arguments: folder, connection, engine, connect timeout [s], file descriptor of the status channel."""
+    folder, connection, engine, timeout, descriptor = sys.argv[1:]
+    status = Status(socket.socket(fileno=int(descriptor)))
+    try:
+        return fly(Path(folder), connection, engine, float(timeout), status)
+    except CompanionError as error:
+        status.send(error=str(error))
+        return int(error.exit_code)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

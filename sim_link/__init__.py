@@ -1,0 +1,1 @@
+"""A simulated PX4 multirotor that speaks MAVLink over UDP."""

@@ -1,0 +1,421 @@
+"""The autopilot above the inner loops: modes, arming, offboard control, failsafes, automatic disarming.
+
+A state machine with injected time: it reads no clock and owns no socket. Requests come in as methods that answer with a
+MAV_RESULT, `update` advances it and gives what the inner loops shall follow.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+from .codec import ActuatorControls, AttitudeTarget
+from .failsafe import Action, Cause, Decision, Health, decide
+from .guidance import Guidance
+from .inner_loops import ATTITUDE, RATES, STOPPED_SETPOINT, Setpoint
+from .land_detector import LandDetector, Motion
+from .modes import Mode
+from .offboard import Offboard, Order
+from .parameters import Parameters
+from .physics import RigidState
+from .position_loop import PositionParameters, initial_position_state, position_control
+from .rotation import Quat, Vec3
+from .watch import DisarmTimer, TiltWatch
+
+HEALTH_PERIOD_US = 100_000
+WATCH_PERIOD_US = 20_000
+EARLY_FLIGHT_S = 3.0
+"""After the spool-up: so long a tilt failure disarms."""
+TILT_BREAKER = 121212
+_LONG_AGO_US = 60_000_000
+
+EMERGENCY, CRITICAL, WARNING, NOTICE, INFO = 0, 2, 4, 5, 6
+"""MAV_SEVERITY"""
+
+_IDLE = Setpoint(RATES, 0.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), math.nan, (0.0, 0.0, 0.0))
+_RATE_OR_LEVEL = (Mode.STABILIZED, Mode.MANUAL, Mode.ACRO)
+
+
+class Result(IntEnum):
+    """MAV_RESULT"""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+class Autopilot:
+    """One vehicle's autopilot. Positions are NED [m], times vehicle time [us]."""
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        *,
+        px4: str,
+        system: int,
+        rigid: RigidState,
+        in_air: bool,
+        now_us: int,
+        home: Vec3,
+        setpoint_delay_us: int = 0,
+    ) -> None:
+        self.parameters = parameters
+        self.px4 = px4
+        self.offboard = Offboard(parameters, px4, system, setpoint_delay_us)
+        self.guidance = Guidance(parameters, home)
+        self.land = LandDetector(parameters, landed=not in_air)
+        self.armed = in_air
+        self.mode = Mode.HOLD
+        """What is flown (nav_state)."""
+        self.intended = Mode.HOLD
+        """What was asked for; differs from `mode` during a failsafe."""
+        self.failsafe: Decision | None = None
+        self.terminated = False
+        self.texts: list[tuple[int, str]] = []
+        """STATUSTEXTs to send: severity, sentence. Whoever sends them empties the list."""
+        self.held = STOPPED_SETPOINT
+        """What the inner loops follow."""
+        self.attitude_setpoint: Setpoint | None = None
+        """The last attitude setpoint of any source, which ATTITUDE_TARGET goes on reporting."""
+        self._rigid = rigid
+        self._now_us = now_us
+        self._health_us = now_us
+        self._watch_us = now_us
+        self._armed_us = now_us - _LONG_AGO_US
+        self._took_off = in_air
+        self._offboard_ok = False
+        self._sticks_us: int | None = None
+        self._ground_us: int | None = None
+        self._sticks_at_arming = False
+        self._lost_us: dict[Cause, int] = {}
+        self._disarm_timer = DisarmTimer(parameters)
+        self._tilt = TiltWatch(parameters)
+        self._position_state = initial_position_state(rigid.v)
+        self._position_parameters = PositionParameters()
+        self._position_version = -1
+        self._guided = False
+        self.guidance.enter(Mode.HOLD, rigid.p, rigid.v, yaw_of(rigid.q), rigid.p)
+
+    # Requests
+
+    def set_mode(self, mode: Mode) -> Result:
+        """Ask for a mode. While disarmed any can be chosen, in flight only one that can run."""
+        if self.terminated or mode is Mode.TERMINATION or (self.armed and not self._can_run(mode)):
+            self._say(CRITICAL, f"Switching to mode '{mode.label}' is currently not possible")
+            return Result.TEMPORARILY_REJECTED
+        if mode is not self.intended:
+            self.intended = mode
+            if mode is not Mode.TAKEOFF:
+                self.guidance.takeoff_height_m = None
+        self._evaluate()
+        return Result.ACCEPTED
+
+    def takeoff(self, height_m: float | None) -> Result:
+        """Ask for Takeoff to a height above home [m], None: MIS_TAKEOFF_ALT above here. Does not arm."""
+        self.guidance.takeoff_height_m = height_m
+        return self.set_mode(Mode.TAKEOFF)
+
+    def arm(self) -> Result:
+        """Arm, if the mode in charge allows it and what it needs is there."""
+        if self.armed:
+            return Result.ACCEPTED
+        reason = self._arming_obstacle()
+        if reason is not None:
+            self._say(CRITICAL, f"Arming denied: {reason}")
+            return Result.TEMPORARILY_REJECTED
+        self.armed = True
+        self._armed_us = self._now_us
+        self._took_off = False
+        self._sticks_at_arming = self.sticks_ok
+        self.guidance.home = self._rigid.p
+        self.guidance.enter(self.mode, self._rigid.p, self._rigid.v, yaw_of(self._rigid.q))
+        self.offboard.evaluate(self._now_us)
+        self._say(INFO, "Armed by external command")
+        return Result.ACCEPTED
+
+    def disarm(self, *, force: bool) -> Result:
+        """Disarm; in the air only by force."""
+        if self.armed and not force and not self.land.landed:
+            self._say(CRITICAL, "Disarming denied: not landed")
+            return Result.TEMPORARILY_REJECTED
+        self._disarm("Disarmed by external command")
+        return Result.ACCEPTED
+
+    def terminate(self) -> Result:
+        """Stop the rotors for good (flight termination)."""
+        self._terminate("Flight termination commanded")
+        return Result.ACCEPTED
+
+    def attitude_target(self, message: AttitudeTarget) -> bool:
+        """Take a SET_ATTITUDE_TARGET; returns whether it was accepted."""
+        taken = self.offboard.take_attitude_target(message, self._now_us, self.mode is Mode.OFFBOARD)
+        if taken and not self._offboard_ok:
+            self._check()
+        return taken
+
+    def actuator_controls(self, message: ActuatorControls) -> bool:
+        """Take a SET_ACTUATOR_CONTROL_TARGET; returns whether it was accepted."""
+        taken = self.offboard.take_actuator_controls(message, self._now_us, self.mode is Mode.OFFBOARD)
+        if taken and not self._offboard_ok:
+            self._check()
+        return taken
+
+    def manual_control(self) -> None:
+        """Take note of a MANUAL_CONTROL message: sticks are there if COM_RC_IN_MODE lets a joystick be a source."""
+        if self.parameters.integer("COM_RC_IN_MODE") in (1, 2, 3):
+            self._sticks_us = self._now_us
+
+    def ground_heartbeat(self) -> None:
+        """Take note of a ground station's heartbeat."""
+        self._ground_us = self._now_us
+
+    # What there is to report
+
+    @property
+    def sticks_ok(self) -> bool:
+        """Whether a source of manual control is there."""
+        limit_s = self.parameters.number("COM_RC_LOSS_T")
+        return self._sticks_us is not None and (self._now_us - self._sticks_us) * 1e-6 <= limit_s
+
+    @property
+    def ground_ok(self) -> bool:
+        """Whether a ground station is there, or none is asked for (NAV_DLL_ACT = 0)."""
+        if self.parameters.integer("NAV_DLL_ACT") <= 0:
+            return True
+        limit_s = self.parameters.number("COM_DL_LOSS_T")
+        return self._ground_us is not None and (self._now_us - self._ground_us) * 1e-6 <= limit_s
+
+    @property
+    def in_failsafe(self) -> bool:
+        """Whether a failsafe acts. One without an action does not count: PX4 shows nothing of it either."""
+        return self.failsafe is not None and self.failsafe.action is not Action.NONE
+
+    @property
+    def ready_to_arm(self) -> bool:
+        """Whether arming would be allowed now."""
+        return self._arming_obstacle() is None
+
+    # Time
+
+    def update(self, now_us: int, rigid: RigidState, dt_s: float) -> Order:
+        """Advance to `now_us`, where the vehicle is in state `rigid`; gives the order for the next dt_s."""
+        self.observe(now_us, rigid)
+        if now_us >= self._health_us:
+            self._health_us += HEALTH_PERIOD_US
+            self._check()
+        if now_us >= self._watch_us:
+            self._watch_us += WATCH_PERIOD_US
+            self._watch(now_us, rigid)
+        order = self._order(rigid, dt_s)
+        self.held = order.setpoint
+        if order.setpoint.mode == ATTITUDE:
+            self.attitude_setpoint = order.setpoint
+        return order
+
+    def observe(self, now_us: int, rigid: RigidState) -> None:
+        """Take note of the time and the state at which the next requests come in."""
+        self._now_us = now_us
+        self._rigid = rigid
+
+    def _watch(self, now_us: int, rigid: RigidState) -> None:
+        """Run the land and tilt detectors and act on what they say."""
+        thrust = self.held.thrust
+        climb_controlled = self.mode is not Mode.OFFBOARD and self.mode not in _RATE_OR_LEVEL
+        motion = Motion(
+            rigid.v,
+            rigid.w,
+            0.0 if math.isnan(thrust) else thrust,
+            climb_controlled,
+            climb_controlled and self.guidance.descending,
+            self.armed,
+        )
+        self.land.update(motion, now_us)
+        if not self.armed:
+            return
+        self._took_off = self._took_off or not self.land.landed
+        if self.mode is Mode.TAKEOFF and self.guidance.takeoff_done:
+            self.intended = Mode.HOLD
+            self._evaluate()
+        reason = self._disarm_timer.update(now_us, self.land.landed, self._took_off)
+        if reason is not None:
+            self._disarm(reason)
+            return
+        attitude_controlled = (
+            self.offboard.controls_attitude if self.mode is Mode.OFFBOARD else self.mode is not Mode.ACRO
+        )
+        if self._tilt.failed(now_us, rigid.q, attitude_controlled):
+            self._tilt_failure(now_us)
+
+    def _tilt_failure(self, now_us: int) -> None:
+        """Answer a tilt beyond FD_FAIL_R or FD_FAIL_P: early in a flight disarm, later terminate if that is enabled."""
+        early_s = self.parameters.number("COM_SPOOLUP_TIME") + EARLY_FLIGHT_S
+        if (now_us - self._armed_us) * 1e-6 < early_s:
+            self._disarm("Disarmed by failure detector: attitude")
+        elif self.parameters.integer("CBRK_FLIGHTTERM") != TILT_BREAKER:
+            self._terminate("Attitude failure: flight terminated")
+        elif self._tilt.first_report():
+            self._say(CRITICAL, "Attitude failure detected")
+
+    def _order(self, rigid: RigidState, dt_s: float) -> Order:
+        """Give the setpoint of the mode in charge."""
+        guided = False
+        if not self.armed or self.terminated:
+            order = Order(STOPPED_SETPOINT, False)
+        elif self.mode is Mode.OFFBOARD:
+            order = self.offboard.order(self._now_us, self.held)
+        elif self.mode in _RATE_OR_LEVEL:
+            order = Order(_IDLE if self.land.landed else self._centred(rigid.q), True)
+        elif self._stays_on_ground():
+            order = Order(_IDLE, False)
+        else:
+            guided = True
+            order = Order(self._steer(rigid, dt_s), True)
+        self._guided = guided
+        return order
+
+    def _stays_on_ground(self) -> bool:
+        """Tell whether a mode that steers itself keeps the rotors idling."""
+        if self.guidance.wants_to_fly():
+            return (self._now_us - self._armed_us) * 1e-6 < self.parameters.number("COM_SPOOLUP_TIME")
+        return self.land.landed or (self.guidance.descending and self.land.ground_contact)
+
+    def _steer(self, rigid: RigidState, dt_s: float) -> Setpoint:
+        """Run the flight task and the position controller."""
+        if not self._guided:
+            self._position_state = initial_position_state(rigid.v)
+        if self._position_version != self.parameters.version:
+            self._position_version = self.parameters.version
+            self._position_parameters = position_parameters(self.parameters)
+        target = self.guidance.setpoint(rigid.p, rigid.v, dt_s)
+        setpoint, self._position_state = position_control(
+            rigid.p, rigid.v, rigid.q, target, self._position_state, self._position_parameters, dt_s
+        )
+        return setpoint
+
+    def _centred(self, q: Quat) -> Setpoint:
+        """Give what centred sticks mean: level or no rotation, at the hover thrust. Nobody holds the position."""
+        thrust = self.parameters.number("MPC_THR_HOVER")
+        if self.mode is Mode.ACRO:
+            return Setpoint(RATES, thrust, (0.0, 0.0, 0.0), q, math.nan, (0.0, 0.0, 0.0))
+        yaw = yaw_of(q)
+        level = (math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0))
+        return Setpoint(ATTITUDE, thrust, (0.0, 0.0, 0.0), level, math.nan, (0.0, 0.0, 0.0))
+
+    # Failsafe and arming
+
+    def _check(self) -> None:
+        """Look at the offboard signal and the links again, and act on it.
+
+        PX4 does so at 10 Hz, and at once when a lost signal returns.
+        """
+        self._offboard_ok = self.offboard.signal_ok(self._now_us)
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Choose what is flown: the mode that was asked for, or a failsafe's."""
+        decision = None
+        if self.armed and not self.terminated:
+            health = Health(self._offboard_ok, self.sticks_ok, self._sticks_at_arming, self.ground_ok)
+            decision = self._delayed(decide(self.intended, health, self.parameters))
+        changed = decision != self.failsafe
+        self.failsafe = decision
+        if self.in_failsafe and decision is not None and changed:
+            self._say(CRITICAL, f"{decision.cause.value}: {decision.action.label}")
+        if decision is not None and decision.action is Action.DISARM:
+            self._disarm(f"{decision.cause.value}: disarmed")
+        elif decision is not None and decision.action is Action.TERMINATE:
+            self._terminate(f"{decision.cause.value}: flight terminated")
+        elif not self.terminated:
+            mode = decision.action.mode if decision is not None else None
+            self._fly(mode or self.intended)
+
+    def _delayed(self, decision: Decision | None) -> Decision | None:
+        """Hold for COM_FAIL_ACT_T before a link loss acts. The loss of the offboard signal acts at once."""
+        if decision is None or decision.cause is Cause.OFFBOARD_LOST or decision.action is Action.NONE:
+            self._lost_us.clear()
+            return decision
+        since = self._lost_us.setdefault(decision.cause, self._now_us)
+        if (self._now_us - since) * 1e-6 < self.parameters.number("COM_FAIL_ACT_T"):
+            return Decision(Action.HOLD, decision.cause)
+        return decision
+
+    def _fly(self, mode: Mode) -> None:
+        """Change what is flown."""
+        if mode is self.mode:
+            return
+        point = self.guidance.takeoff_point if mode is Mode.HOLD and self.guidance.takeoff_done else None
+        self.mode = mode
+        if mode is Mode.OFFBOARD:
+            self.offboard.enter(self._now_us)
+        else:
+            self.guidance.enter(mode, self._rigid.p, self._rigid.v, yaw_of(self._rigid.q), point)
+
+    def _can_run(self, mode: Mode) -> bool:
+        """Tell whether a mode has what it needs."""
+        if mode is Mode.OFFBOARD:
+            return self._offboard_ok
+        if mode is Mode.MISSION:
+            return False
+        return self.sticks_ok or not mode.needs_sticks
+
+    def _arming_obstacle(self) -> str | None:
+        """Give the reason why arming is denied; None when it is not."""
+        if self.terminated:
+            return "flight is terminated"
+        if self.parameters.integer("COM_ARMABLE") == 0:
+            return "COM_ARMABLE is 0"
+        if not self.intended.can_arm:
+            return f"mode {self.intended.label} prevents it, switch to another one first"
+        if self.intended is Mode.OFFBOARD and not self._offboard_ok:
+            return "no offboard signal"
+        if self.intended is Mode.MISSION:
+            return "no valid mission"
+        if self.intended.needs_sticks and not self.sticks_ok:
+            return "no manual control input"
+        if not self.ground_ok:
+            return "no connection to the ground control station"
+        return None
+
+    def _disarm(self, sentence: str) -> None:
+        """Stop the rotors."""
+        if not self.armed:
+            return
+        self.armed = False
+        self._say(NOTICE, sentence)
+        self._disarm_timer.reset()
+        self._evaluate()
+
+    def _terminate(self, sentence: str) -> None:
+        """Stop the rotors until the vehicle is started anew."""
+        if not self.terminated:
+            self.terminated = True
+            self.mode = Mode.TERMINATION
+            self._say(EMERGENCY, sentence)
+
+    def _say(self, severity: int, sentence: str) -> None:
+        """Queue a STATUSTEXT."""
+        self.texts.append((severity, sentence))
+
+
+_POSITION_RANGES = {
+    "MPC_XY_VEL_P_ACC": (0.1, 20.0),
+    "MPC_TILTMAX_AIR": (1.0, 85.0),
+    "MPC_THR_MIN": (0.01, 0.5),
+    "MPC_THR_MAX": (0.5, 1.0),
+    "MPC_THR_HOVER": (0.1, 0.8),
+}
+"""Nobody checks the range of a PARAM_SET; the controller limits what it could not compute with. Others: 0 to 1000."""
+
+
+def position_parameters(parameters: Parameters) -> PositionParameters:
+    """Give the position controller's parameters, limited to what it can compute with."""
+    names = PositionParameters._fields
+    return PositionParameters(*(parameters.within(name, *_POSITION_RANGES.get(name, (0.0, 1000.0))) for name in names))
+
+
+def yaw_of(q: Quat) -> float:
+    """Give the heading [rad] of an attitude."""
+    w, x, y, z = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

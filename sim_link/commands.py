@@ -1,0 +1,174 @@
+"""COMMAND_LONG and COMMAND_INT: every command for this vehicle is answered with a COMMAND_ACK."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from .autopilot import Autopilot, Result
+from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, mavlink
+from .geodesy import HOME_ALTITUDE_M
+from .link import Link
+from .messages import Telemetry
+from .modes import FLAG_CUSTOM_MODE, Mode, from_numbers
+
+FORCE = 21196
+"""COMPONENT_ARM_DISARM's param2: disarms in the air. It does not skip the checks when arming."""
+_INT32_MAX = 2147483647
+_LOCAL_FRAMES = frozenset((1, 4, 7, 8, 9, 12, 20, 21))
+_ALL = frozenset(range(1, 8))
+
+# The parameters that may be other than 0 or NaN (mavlink_command_params.hpp); any other makes 1.18 deny the command.
+_ALLOWED: dict[int, frozenset[int]] = {
+    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: frozenset((1, 2)),
+    mavlink.MAV_CMD_DO_SET_MODE: frozenset((1, 2, 3)),
+    mavlink.MAV_CMD_NAV_TAKEOFF: frozenset((1, 4, 5, 6, 7)),
+    mavlink.MAV_CMD_NAV_LAND: frozenset((1, 2, 4, 5, 6, 7)),
+    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: frozenset(),
+    mavlink.MAV_CMD_DO_FLIGHTTERMINATION: frozenset((1,)),
+}
+
+
+class Command(NamedTuple):
+    """A command in either form."""
+
+    number: int
+    params: tuple[float, ...]
+    """param1 to param7; what was not given is NaN or 0."""
+
+    def whole(self, number: int) -> int | None:
+        """Give a param as a whole number; None when it is none."""
+        value = self.params[number - 1]
+        return round(value) if math.isfinite(value) else None
+
+    def is_set(self, number: int) -> bool:
+        """Tell whether a param is other than 0 and NaN."""
+        value = self.params[number - 1]
+        return not (math.isnan(value) or value == 0.0)
+
+
+class Commands:
+    """The commands that this vehicle obeys."""
+
+    def __init__(self, autopilot: Autopilot, telemetry: Telemetry, *, system: int) -> None:
+        self._autopilot = autopilot
+        self._telemetry = telemetry
+        self._system = system
+        self._handlers: dict[int, Callable[[Command], Result]] = {
+            mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
+            mavlink.MAV_CMD_DO_SET_MODE: self._set_mode,
+            mavlink.MAV_CMD_NAV_TAKEOFF: self._takeoff,
+            mavlink.MAV_CMD_NAV_LAND: lambda _: self._autopilot.set_mode(Mode.LAND),
+            mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._autopilot.set_mode(Mode.RETURN),
+            mavlink.MAV_CMD_DO_FLIGHTTERMINATION: self._flight_termination,
+        }
+        self._link_handlers: dict[int, Callable[[Command, Link, int], Result]] = {
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
+            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+        }
+        if autopilot.px4 == "1.13":
+            self._link_handlers[mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES] = self._request_capabilities
+
+    def handle(self, message: Any, sender: tuple[int, int], link: Link, now_us: int) -> None:
+        """Obey a COMMAND_LONG or COMMAND_INT and acknowledge it; one for another target gets no answer."""
+        if message.target_system not in (0, self._system) or message.target_component not in (0, AUTOPILOT_COMPONENT):
+            return
+        if sender == (self._system, AUTOPILOT_COMPONENT):
+            return
+        command = _read(message)
+        result = self._obey(command, link, now_us)
+        link.send(mavlink.MAVLink_command_ack_message(command.number, int(result), 0, 0, *sender))
+
+    def _obey(self, command: Command, link: Link, now_us: int) -> Result:
+        """Find the command's handler; refuse params that it does not know."""
+        if self._autopilot.px4 != "1.13":
+            forbidden = _ALL - _ALLOWED.get(command.number, _ALL)
+            if any(command.is_set(number) for number in forbidden):
+                return Result.DENIED
+        handler = self._handlers.get(command.number)
+        if handler is not None:
+            return handler(command)
+        link_handler = self._link_handlers.get(command.number)
+        if link_handler is not None:
+            return link_handler(command, link, now_us)
+        return Result.UNSUPPORTED
+
+    def _arm_disarm(self, command: Command) -> Result:
+        wanted = command.whole(1)
+        if wanted == 1:
+            return self._autopilot.arm()
+        if wanted == 0:
+            return self._autopilot.disarm(force=command.whole(2) == FORCE)
+        return Result.UNSUPPORTED
+
+    def _set_mode(self, command: Command) -> Result:
+        """DO_SET_MODE: param1 base mode with the custom bit, param2 main, param3 sub mode; not the packed number."""
+        base, main, sub = command.whole(1), command.whole(2), command.whole(3)
+        mode = None
+        if base is not None and base & FLAG_CUSTOM_MODE and main is not None:
+            mode = from_numbers(main, sub or 0)
+        return Result.TEMPORARILY_REJECTED if mode is None else self._autopilot.set_mode(mode)
+
+    def _takeoff(self, command: Command) -> Result:
+        """NAV_TAKEOFF: param7 is the height above sea level; without one MIS_TAKEOFF_ALT above here. Does not arm."""
+        altitude_m = command.params[6]
+        if not math.isfinite(altitude_m):
+            return self._autopilot.takeoff(None)
+        home_altitude_m = HOME_ALTITUDE_M - self._autopilot.guidance.home[2]
+        return self._autopilot.takeoff(altitude_m - home_altitude_m)
+
+    def _flight_termination(self, command: Command) -> Result:
+        if command.params[0] > 0.5:
+            return self._autopilot.terminate()
+        return Result.UNSUPPORTED
+
+    def _set_interval(self, command: Command, link: Link, now_us: int) -> Result:
+        """SET_MESSAGE_INTERVAL, for the link it came on; params 3, 4 and 7 must be 0 or NaN."""
+        msg_id, interval_us = command.whole(1), command.whole(2)
+        if msg_id is None or interval_us is None or msg_id == ID_HEARTBEAT:
+            return Result.FAILED
+        if any(command.is_set(number) for number in (3, 4, 7)):
+            return Result.FAILED
+        return Result.ACCEPTED if link.set_interval(msg_id, interval_us, now_us) else Result.FAILED
+
+    def _get_interval(self, command: Command, link: Link, now_us: int) -> Result:
+        """GET_MESSAGE_INTERVAL: answered with MESSAGE_INTERVAL, 0 for a message that there is not."""
+        msg_id = command.whole(1)
+        if msg_id is None or not 0 <= msg_id <= 0xFFFF:
+            return Result.FAILED
+        link.send(mavlink.MAVLink_message_interval_message(msg_id, link.interval_us(msg_id) or 0))
+        return Result.ACCEPTED
+
+    def _request_message(self, command: Command, link: Link, now_us: int) -> Result:
+        """REQUEST_MESSAGE: denied when there is no such message or no data for it yet."""
+        msg_id = command.whole(1)
+        return Result.DENIED if msg_id is None else self._send(msg_id, link)
+
+    def _request_capabilities(self, command: Command, link: Link, now_us: int) -> Result:
+        """REQUEST_AUTOPILOT_CAPABILITIES, gone in 1.18."""
+        return self._send(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, link)
+
+    def _send(self, msg_id: int, link: Link) -> Result:
+        """Queue one message on a link."""
+        content = self._telemetry.build(msg_id)
+        if content is None:
+            return Result.DENIED
+        if isinstance(content, bytes):
+            link.send_hot(msg_id, content)
+        else:
+            link.send(content)
+        return Result.ACCEPTED
+
+
+def _read(message: Any) -> Command:
+    """Bring COMMAND_LONG and COMMAND_INT to one form; x and y are scaled, the largest number in both means NaN."""
+    if message.get_type() == "COMMAND_LONG":
+        last = (message.param5, message.param6, message.param7)
+    elif message.x == _INT32_MAX and message.y == _INT32_MAX:
+        last = (math.nan, math.nan, message.z)
+    else:
+        scale = 1e-4 if message.frame in _LOCAL_FRAMES else 1e-7
+        last = (scale * message.x, scale * message.y, message.z)
+    return Command(message.command, (message.param1, message.param2, message.param3, message.param4, *last))

@@ -1,0 +1,142 @@
+"""One MAVLink link of the vehicle: its encoder, its message intervals, and what waits to be sent on it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, ID_TIMESYNC, Encoder, mavlink
+
+_INT32_MAX = 2147483647
+
+
+@dataclass(slots=True)
+class Stream:
+    """How often one message is sent."""
+
+    default_us: int
+    """PX4's interval on this kind of link; 0: not sent unless asked for."""
+    interval_us: int
+    """The present interval; 0: not sent."""
+    due_us: int
+    """Vehicle time of the next one."""
+
+
+def _id(name: str) -> int:
+    return int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
+
+
+# Rates in Hz as PX4 starts its links (mavlink_main.cpp), of the messages that this vehicle has. 0: only on request.
+ONBOARD_HZ: Mapping[int, float] = {
+    ID_HEARTBEAT: 1.0,
+    ID_TIMESYNC: 10.0,
+    _id("ODOMETRY"): 30.0,
+    _id("ATTITUDE_QUATERNION"): 50.0,
+    _id("LOCAL_POSITION_NED"): 30.0,
+    _id("GLOBAL_POSITION_INT"): 50.0,
+    _id("ATTITUDE_TARGET"): 10.0,
+    _id("SYS_STATUS"): 5.0,
+    _id("EXTENDED_SYS_STATE"): 5.0,
+    _id("ESTIMATOR_STATUS"): 1.0,
+    _id("HOME_POSITION"): 0.5,
+    _id("CURRENT_MODE"): 0.5,
+    _id("AUTOPILOT_VERSION"): 0.0,
+}
+GROUND_HZ: Mapping[int, float] = {
+    ID_HEARTBEAT: 1.0,
+    ID_TIMESYNC: 0.0,
+    _id("ODOMETRY"): 0.0,
+    _id("ATTITUDE_QUATERNION"): 50.0,
+    _id("LOCAL_POSITION_NED"): 50.0,
+    _id("GLOBAL_POSITION_INT"): 50.0,
+    _id("ATTITUDE_TARGET"): 50.0,
+    _id("SYS_STATUS"): 1.0,
+    _id("EXTENDED_SYS_STATE"): 1.0,
+    _id("ESTIMATOR_STATUS"): 0.5,
+    _id("HOME_POSITION"): 0.5,
+    _id("CURRENT_MODE"): 0.5,
+    _id("AUTOPILOT_VERSION"): 0.0,
+}
+
+
+class Link:
+    """A link without its socket: whoever owns the socket sends what gathers in `outbox`."""
+
+    def __init__(self, system: int, rates_hz: Mapping[int, float], now_us: int, *, quiet: bool = False) -> None:
+        self.encoder = Encoder(system, AUTOPILOT_COMPONENT)
+        self.outbox: list[bytes] = []
+        """Frames to send, one datagram each."""
+        self.parameters_to_send: deque[str] = deque()
+        """Names of a parameter list under way."""
+        self.quiet = quiet
+        """Sends its heartbeat only, until somebody has spoken on it."""
+        self._next_us = 0
+        """Vehicle time before which nothing but the messages of every state is due."""
+        self._every_state: list[int] = []
+        self.streams: dict[int, Stream] = {}
+        for number, rate in rates_hz.items():
+            interval = round(1e6 / rate) if rate > 0.0 else 0
+            self.streams[number] = Stream(interval, interval, now_us)
+
+    def send(self, message: Any) -> None:
+        """Queue a pymavlink message."""
+        self.outbox.append(self.encoder.cold(message))
+
+    def send_hot(self, msg_id: int, payload: bytes) -> None:
+        """Queue a message whose payload is packed already."""
+        self.outbox.append(self.encoder.hot(msg_id, payload))
+
+    def set_interval(self, msg_id: int, interval_us: int, now_us: int) -> bool:
+        """Set a message's interval: above 0 that one, 0 PX4's default, below 0 never. False: no such message.
+
+        HEARTBEAT is known but keeps its rate.
+        """
+        stream = self.streams.get(msg_id)
+        if stream is None:
+            return False
+        if msg_id != ID_HEARTBEAT:
+            stream.interval_us = stream.default_us if interval_us == 0 else min(max(interval_us, 0), _INT32_MAX)
+            stream.due_us = now_us
+            self._next_us = 0
+        return True
+
+    def interval_us(self, msg_id: int) -> int | None:
+        """Give a message's interval as MESSAGE_INTERVAL has it: -1 when it is not sent; None: no such message."""
+        stream = self.streams.get(msg_id)
+        if stream is None:
+            return None
+        return stream.interval_us or -1
+
+    def due(self, now_us: int, period_us: int) -> list[int]:
+        """Give the messages to send now; period_us is the time between two states.
+
+        An interval of at most that period gives every state. A longer one keeps its rate on average, whatever the grid.
+        """
+        if now_us < self._next_us:
+            return [] if self.quiet else self._every_state.copy()
+        self._every_state = []
+        self._next_us = now_us + _INT32_MAX
+        ids: list[int] = []
+        for msg_id, stream in self.streams.items():
+            if stream.interval_us == 0 or (self.quiet and msg_id != ID_HEARTBEAT):
+                continue
+            if stream.interval_us <= period_us:
+                self._every_state.append(msg_id)
+            elif now_us < stream.due_us:
+                self._next_us = min(self._next_us, stream.due_us)
+                continue
+            else:
+                stream.due_us += stream.interval_us
+                if stream.due_us <= now_us:
+                    stream.due_us = now_us + stream.interval_us
+                self._next_us = min(self._next_us, stream.due_us)
+            ids.append(msg_id)
+        return ids
+
+    def speak(self) -> None:
+        """End the silence of a quiet link: somebody is there."""
+        if self.quiet:
+            self.quiet = False
+            self._next_us = 0

@@ -1,0 +1,279 @@
+"""Gives a vehicle its sockets and its time: real time, a multiple of it, or lockstep with the companion.
+
+Lockstep: after each state the vehicle asks with TIMESYNC (tc1 = 0, ts1 = its time), and its clock waits until the
+answer with that ts1 has come. What came before the answer is acted on first, in order; what comes after it belongs to
+the next state. No wall clock enters the simulation, so that the same seed and the same companion give the same flight
+to the byte.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from .codec import ID_TIMESYNC, TIMESYNC, Frame, timesync
+from .link import Link
+from .truth_log import TruthLog
+from .udp import Address, UdpEndpoint
+from .vehicle import Vehicle
+
+PATIENCE_S = 1.0
+"""Wall time that the clock waits for a companion's answer; then it runs on at real time until one answers again."""
+_HEARTBEAT_WALL_S = 0.2
+"""Between heartbeats while the clock stands still and waits for the first companion."""
+_SLICE_S = 0.1
+"""Longest single wait, so that a stop is noticed."""
+_SPIN_S = float(__import__("os").environ.get("SPIN","0"))
+_LATE_MAX_S = 0.25
+"""Of lateness so much is caught up with; the rest is let go."""
+
+
+@dataclass(frozen=True)
+class PeerOptions:
+    """Ports and time."""
+
+    port: int
+    """Companion link, local; 0: any free one."""
+    remote_port: int
+    """Companion link, spoken to first; 0: nobody until somebody speaks."""
+    ground_port: int | None = None
+    """Ground link, local; None: there is none."""
+    ground_remote_port: int = 14550
+    truth_port: int | None = None
+    """Where the truth goes; None: nowhere."""
+    lockstep: bool = False
+    speed: float = 1.0
+    """Vehicle time per wall time, without lockstep."""
+
+
+def _never() -> bool:
+    return False
+
+
+def _silent(sentence: str) -> None:
+    """Tell nobody."""
+
+
+class Peer:
+    """Runs one vehicle on real sockets, in the calling thread."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        options: PeerOptions,
+        *,
+        stopped: Callable[[], bool] = _never,
+        notice: Callable[[str], None] = _silent,
+    ) -> None:
+        """Open the sockets.
+
+        Args:
+            vehicle: what to run.
+            options: ports and time.
+            stopped: asked often; once it says yes, `run` returns.
+            notice: gets a sentence when the companion falls silent in lockstep, and when it is back.
+
+        Raises:
+            PortError: a port is in use.
+        """
+        self.vehicle = vehicle
+        self.options = options
+        self.companion = UdpEndpoint(options.port, options.remote_port, "--port")
+        self.ground: UdpEndpoint | None = None
+        self._truth: UdpEndpoint | None = None
+        try:
+            if options.ground_port is not None:
+                self.ground = UdpEndpoint(options.ground_port, options.ground_remote_port, "--ground-port")
+            if options.truth_port is not None:
+                self._truth = UdpEndpoint(0, options.truth_port, "--truth-port")
+        except OSError:
+            self.companion.close()
+            if self.ground is not None:
+                self.ground.close()
+            raise
+        self.synchronous = options.lockstep
+        """Whether the clock waits for the companion; False while a silent one lets it run at real time."""
+        vehicle.asks_time = not options.lockstep
+        self._truth_log: TruthLog | None = None
+        self._stopped = stopped
+        self._notice = notice
+        self._endpoints = [self.companion] if self.ground is None else [self.companion, self.ground]
+        self._waiting: deque[tuple[list[Frame], Address]] = deque()
+        self._awaited_ns = -1
+        self._answered = False
+        self._started = not options.lockstep
+        self._deadline_s = time.monotonic()
+        self._ticked_s = self._deadline_s
+
+    def log_truth(self, log: TruthLog) -> None:
+        """Write a row for now and for every state to come; `close` completes the file."""
+        log.write(self.vehicle.airframe.truth())
+        self._truth_log = log
+
+    def run(self, duration_s: float | None = None) -> None:
+        """Run until told to stop, or for a time of the vehicle's."""
+        end_us = None if duration_s is None else self.vehicle.start_us + round(duration_s * 1e6)
+        if not self._started and not self._wait_for_companion():
+            return
+        self._deadline_s = time.monotonic()
+        while not self._stopped() and (end_us is None or self.vehicle.t_us < end_us):
+            self.step()
+
+    def step(self) -> None:
+        """Advance by one state: move, send, then wait as the kind of time asks, acting on what is received."""
+        vehicle = self.vehicle
+        vehicle.tick()
+        self._ticked_s = time.monotonic()
+        if self._truth_log is not None:
+            self._truth_log.write(vehicle.airframe.truth())
+        if self.options.lockstep:
+            self._awaited_ns = vehicle.t_us * 1000
+            self._answered = False
+            vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._awaited_ns, 0, 0))
+        self._flush()
+        if self.synchronous:
+            self._wait_for_answer()
+        else:
+            self._wait_for_time()
+
+    def close(self) -> None:
+        """Close the sockets and complete the truth file."""
+        for endpoint in (*self._endpoints, self._truth):
+            if endpoint is not None:
+                endpoint.close()
+        if self._truth_log is not None:
+            self._truth_log.close()
+
+    # Waiting
+
+    def _wait_for_companion(self) -> bool:
+        """Stand still until a companion's first message is here, which counts after the first state. False: stopped."""
+        next_heartbeat_s = time.monotonic()
+        while not self._stopped():
+            now_s = time.monotonic()
+            if now_s >= next_heartbeat_s:
+                next_heartbeat_s = now_s + _HEARTBEAT_WALL_S
+                self.vehicle.heartbeat()
+                self._flush()
+            timeout_s = max(0.0, min(_SLICE_S, next_heartbeat_s - now_s))
+            if select.select(self._endpoints, (), (), timeout_s)[0]:
+                self._serve_ground()
+                datagram = self.companion.receive()
+                if datagram is not None and datagram[0]:
+                    self._waiting.append(datagram)
+                    self._started = True
+                    return True
+        return False
+
+    def _wait_for_answer(self) -> None:
+        """Act on what comes until the companion has answered this state, for a bounded time."""
+        while self._waiting and not self._answered:
+            self._act(*self._waiting.popleft())
+        give_up_s = self._ticked_s + PATIENCE_S
+        spin_s = time.monotonic() + _SPIN_S
+        while not self._answered and time.monotonic() < spin_s:
+            self._read_companion()
+        while not self._answered:
+            left_s = give_up_s - time.monotonic()
+            if left_s <= 0.0:
+                self.synchronous = False
+                self._deadline_s = time.monotonic()
+                self._notice(f"no answer from the companion for {PATIENCE_S:g} s: going on at real time")
+                break
+            if self._stopped():
+                break
+            self._serve(min(left_s, _SLICE_S))
+        self._flush()
+
+    def _wait_for_time(self) -> None:
+        """Act on what comes until the wall clock has caught up with the vehicle's."""
+        speed = 1.0 if self.options.lockstep else self.options.speed
+        self._deadline_s += self.vehicle.period_us * 1e-6 / speed
+        now_s = time.monotonic()
+        if now_s - self._deadline_s > _LATE_MAX_S:
+            self._deadline_s = now_s
+        self._serve(0.0)
+        while True:
+            self._flush()
+            if self._answered:
+                self.synchronous = True
+                self._notice("the companion answers again: back in lockstep")
+                return
+            left_s = self._deadline_s - time.monotonic()
+            if left_s <= 0.0 or self._stopped():
+                return
+            self._serve(min(left_s, _SLICE_S))
+
+    def _serve(self, timeout_s: float) -> None:
+        """Wait until something is received, and act on it."""
+        for endpoint in select.select(self._endpoints, (), (), max(0.0, timeout_s))[0]:
+            if endpoint is self.companion:
+                self._read_companion()
+            else:
+                self._serve_ground()
+
+    # Receiving and sending
+
+    def _read_companion(self) -> None:
+        """Act on the companion's datagrams: all that are there, but in lockstep none beyond the answer."""
+        while not (self._answered and self.options.lockstep):
+            datagram = self.companion.receive()
+            if datagram is None:
+                return
+            self._act(*datagram)
+
+    def _act(self, found: list[Frame], sender: Address) -> None:
+        """Act on the messages of one datagram."""
+        for frame in found:
+            if frame.msg_id == ID_TIMESYNC:
+                self._timesync(frame, self.vehicle.companion, sender == self.companion.partner)
+            else:
+                self.vehicle.receive(frame, self.vehicle.companion)
+
+    def _serve_ground(self) -> None:
+        """Act on what the ground link has received."""
+        if self.ground is None:
+            return
+        while (datagram := self.ground.receive()) is not None:
+            for frame in datagram[0]:
+                self.vehicle.ground.speak()
+                if frame.msg_id == ID_TIMESYNC:
+                    self._timesync(frame, self.vehicle.ground, False)
+                else:
+                    self.vehicle.receive(frame, self.vehicle.ground)
+
+    def _timesync(self, frame: Frame, link: Link, from_companion: bool) -> None:
+        """Answer a request; take an answer to ours as the end of a lockstep exchange."""
+        tc1, ts1 = timesync(frame.payload)
+        if tc1 == 0:
+            link.send_hot(ID_TIMESYNC, TIMESYNC.pack(self._now_ns(), ts1, frame.system, frame.component))
+            return
+        # While running free, any answer shows that the companion is back.
+        wanted = ts1 == self._awaited_ns or (not self.synchronous and 0 < ts1 <= self._awaited_ns)
+        if wanted and from_companion and self.options.lockstep:
+            self._answered = True
+
+    def _now_ns(self) -> int:
+        """Give the vehicle's time; between two states it follows the wall clock, but not in lockstep."""
+        now_ns = self.vehicle.t_us * 1000
+        if self.options.lockstep:
+            return now_ns
+        since_ns = round((time.monotonic() - self._ticked_s) * self.options.speed * 1e9)
+        return now_ns + min(max(since_ns, 0), self.vehicle.period_us * 1000)
+
+    def _flush(self) -> None:
+        """Send what waits in the outboxes."""
+        vehicle = self.vehicle
+        if vehicle.companion.outbox:
+            self.companion.send(vehicle.companion.outbox)
+        if self.ground is not None:
+            self.ground.send(vehicle.ground.outbox)
+        else:
+            vehicle.ground.outbox.clear()
+        if self._truth is not None and vehicle.truth_outbox:
+            self._truth.send(vehicle.truth_outbox)
+        else:
+            vehicle.truth_outbox.clear()

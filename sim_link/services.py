@@ -1,0 +1,153 @@
+"""What the vehicle answers: dispatch of received messages, the parameter protocol, mode and heartbeat messages.
+
+Commands are in `commands`. Nothing here knows sockets: a message comes with the link it came on, and answers go there.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from . import codec
+from .autopilot import Autopilot
+from .codec import AUTOPILOT_COMPONENT, Decoder, Frame, mavlink
+from .commands import Commands
+from .link import Link
+from .messages import Telemetry
+from .modes import from_custom_mode
+from .parameters import HASH_CHECK, UINT32, ParameterError, Parameters
+
+_PARAM_READ = struct.Struct("<hBB16s")
+_PARAM_LIST = struct.Struct("<BB")
+_PARAM_SET = struct.Struct("<4sBB16sB")
+_PARAM_VALUE = struct.Struct("<4sHH16sB")
+_ID_PARAM_VALUE = 22
+_SET_MODE = struct.Struct("<IBB")
+_HEARTBEAT = struct.Struct("<IBBBBB")
+_HASH_INDEX = 0xFFFF
+_NAME_LENGTH = 16
+
+
+class Services:
+    """Acts on what is received. One object serves all links of a vehicle."""
+
+    def __init__(self, autopilot: Autopilot, parameters: Parameters, telemetry: Telemetry, *, system: int) -> None:
+        self._autopilot = autopilot
+        self._parameters = parameters
+        self._system = system
+        self._decoder = Decoder()
+        self._commands = Commands(autopilot, telemetry, system=system)
+        self._handlers: dict[int, Callable[[Frame, Link, int], None]] = {
+            codec.ID_SET_ATTITUDE_TARGET: self._attitude_target,
+            codec.ID_SET_ACTUATOR_CONTROL_TARGET: self._actuator_controls,
+            codec.ID_HEARTBEAT: self._heartbeat,
+            codec.ID_MANUAL_CONTROL: self._manual_control,
+            codec.ID_SET_MODE: self._set_mode,
+            codec.ID_COMMAND_LONG: self._command,
+            codec.ID_COMMAND_INT: self._command,
+            codec.ID_PARAM_REQUEST_READ: self._parameter_read,
+            codec.ID_PARAM_REQUEST_LIST: self._parameter_list,
+            codec.ID_PARAM_SET: self._parameter_set,
+        }
+
+    def handle(self, frame: Frame, link: Link, now_us: int) -> None:
+        """Act on one message; one that this vehicle has no use for is passed over."""
+        handler = self._handlers.get(frame.msg_id)
+        if handler is not None:
+            handler(frame, link, now_us)
+
+    def send_parameters(self, link: Link, count: int) -> None:
+        """Go on with a parameter list that was asked for on a link."""
+        for _ in range(min(count, len(link.parameters_to_send))):
+            self._send_value(link, link.parameters_to_send.popleft())
+
+    # Setpoints, sticks, heartbeats
+
+    def _attitude_target(self, frame: Frame, link: Link, now_us: int) -> None:
+        self._autopilot.attitude_target(codec.attitude_target(frame.payload))
+
+    def _actuator_controls(self, frame: Frame, link: Link, now_us: int) -> None:
+        self._autopilot.actuator_controls(codec.actuator_controls(frame.payload))
+
+    def _heartbeat(self, frame: Frame, link: Link, now_us: int) -> None:
+        kind = _HEARTBEAT.unpack(codec.padded(frame.payload, _HEARTBEAT.size))[1]
+        if kind == mavlink.MAV_TYPE_GCS:
+            self._autopilot.ground_heartbeat()
+
+    def _manual_control(self, frame: Frame, link: Link, now_us: int) -> None:
+        message = self._decoder.message(frame)
+        if message is not None and message.target == self._system:
+            self._autopilot.manual_control()
+
+    def _set_mode(self, frame: Frame, link: Link, now_us: int) -> None:
+        """SET_MODE (11): packed custom_mode, never acknowledged."""
+        custom_mode, target, _ = _SET_MODE.unpack(codec.padded(frame.payload, _SET_MODE.size))
+        mode = from_custom_mode(custom_mode)
+        if target in (0, self._system) and mode is not None:
+            self._autopilot.set_mode(mode)
+
+    def _command(self, frame: Frame, link: Link, now_us: int) -> None:
+        message = self._decoder.message(frame)
+        if message is not None:
+            self._commands.handle(message, (frame.system, frame.component), link, now_us)
+
+    # Parameters (mavlink_parameters.cpp): the target system must be ours, 0 does not count
+
+    def _is_for_us(self, system: int, component: int) -> bool:
+        return system == self._system and component in (0, AUTOPILOT_COMPONENT)
+
+    def _parameter_list(self, frame: Frame, link: Link, now_us: int) -> None:
+        """PARAM_REQUEST_LIST: the list begins with _HASH_CHECK and goes out bit by bit; asking again begins anew."""
+        if self._is_for_us(*_PARAM_LIST.unpack(codec.padded(frame.payload, _PARAM_LIST.size))):
+            link.parameters_to_send.clear()
+            link.parameters_to_send.append(HASH_CHECK)
+            link.parameters_to_send.extend(self._parameters.names)
+
+    def _parameter_read(self, frame: Frame, link: Link, now_us: int) -> None:
+        """PARAM_REQUEST_READ: by index, or with index -1 by name."""
+        index, system, component, raw = _PARAM_READ.unpack(codec.padded(frame.payload, _PARAM_READ.size))
+        if not self._is_for_us(system, component):
+            return
+        name = _name(raw) if index < 0 else self._parameters.name_at(index)
+        if name is not None and (name == HASH_CHECK or name in self._parameters):
+            self._send_value(link, name)
+        else:
+            self._send_error(frame, link, _name(raw), index, ParameterError.DOES_NOT_EXIST)
+
+    def _parameter_set(self, frame: Frame, link: Link, now_us: int) -> None:
+        """PARAM_SET: bytewise, the type must match; answered with the value as it is now, or with PARAM_ERROR."""
+        value, system, component, raw, kind = _PARAM_SET.unpack(codec.padded(frame.payload, _PARAM_SET.size))
+        if not self._is_for_us(system, component):
+            return
+        name = _name(raw)
+        if name == HASH_CHECK:
+            link.parameters_to_send.clear()  # PX4: the client knows the values already
+            return
+        try:
+            self._parameters.set_wire(name, kind, value)
+        except ParameterError as error:
+            self._send_error(frame, link, name, -1, error.code)
+            return
+        self._send_value(link, name)
+
+    def _send_value(self, link: Link, name: str) -> None:
+        """Queue a PARAM_VALUE."""
+        if name == HASH_CHECK:
+            value, index, kind = self._parameters.hash_wire(), _HASH_INDEX, UINT32
+        else:
+            value, index = self._parameters.wire(name), self._parameters.index_of(name)
+            kind = self._parameters.type_of(name)
+        count = len(self._parameters)
+        link.send_hot(_ID_PARAM_VALUE, _PARAM_VALUE.pack(value, count, index, name.encode(), kind))
+
+    def _send_error(self, frame: Frame, link: Link, name: str, index: int, code: int) -> None:
+        """Queue a PARAM_ERROR; PX4 1.13 did not know that message and kept silent."""
+        if self._autopilot.px4 == "1.13":
+            return
+        text = name.encode("ascii", "replace")[:_NAME_LENGTH]
+        link.send(mavlink.MAVLink_param_error_message(frame.system, frame.component, text, index, code))
+
+
+def _name(raw: bytes) -> str:
+    """Read a parameter's name: 16 bytes, ended by a zero byte when shorter."""
+    return raw.split(b"\0", 1)[0].decode("ascii", "replace")

@@ -1,0 +1,44 @@
+"""Writes what really happened to a CSV file, one row per state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .airframe import Truth
+
+COLUMNS = (
+    *("t_s", "p_n", "p_e", "p_d", "v_n", "v_e", "v_d", "q_w", "q_x", "q_y", "q_z", "w_x", "w_y", "w_z"),
+    *("disturbance_n_m_s2", "disturbance_e_m_s2", "disturbance_d_m_s2"),
+    *("thrust_1_n", "thrust_2_n", "thrust_3_n", "thrust_4_n"),
+)
+"""Vehicle time (as ODOMETRY.time_usec), NED [m, m/s], body to inertial, FRD [rad/s], NED [m/s^2], rotors [N]."""
+
+_ROW = "%d.%06d" + ",%.10g" * (len(COLUMNS) - 1)
+_ROWS_HELD = 500
+
+
+class TruthLog:
+    """A CSV file that is written in blocks; complete once closed."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file. Raises OSError when that is not possible."""
+        self._file = path.open("w", encoding="ascii", newline="")
+        self._rows: list[str] = [",".join(COLUMNS)]
+
+    def write(self, truth: Truth) -> None:
+        """Add one row."""
+        seconds, micros = divmod(truth.t_us, 1_000_000)
+        _, p, v, q, w, rotor_n, _, disturbance = truth
+        self._rows.append(_ROW % (seconds, micros, *p, *v, *q, *w, *disturbance, *rotor_n))
+        if len(self._rows) >= _ROWS_HELD:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left and close; doing so twice is harmless."""
+        if not self._file.closed:
+            self._flush()
+            self._file.close()
+
+    def _flush(self) -> None:
+        self._file.write("\n".join(self._rows) + "\n" if self._rows else "")
+        self._rows.clear()
