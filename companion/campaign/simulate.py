@@ -129,6 +129,7 @@ def fly_sampled(
     trajectory: Trajectory,
     compiled: Kernels,
     progress: Callable[[float], None] = lambda share: None,
+    duration_max_s: float = math.inf,
 ) -> Trace:
     """Flies against the bundled physics, from a hover at [start], for the length of the course.
 
@@ -137,6 +138,7 @@ def fly_sampled(
         trajectory: what is to be flown.
         compiled: the kernels of the control step; the physics runs on the same engine.
         progress: called now and then with the share that is done.
+        duration_max_s: simulate no more of the course than this.
 
     Raises:
         RefusedError: the flight diverges.
@@ -152,7 +154,7 @@ def fly_sampled(
     tracker = Tracker(vehicle, flight.output.kind, compiled)
     n_steps = max(1, round(sim.loop_rate_hz / vehicle.link.state_rate_hz))
     interval_us = n_steps * airframe.dt_us
-    count = int(course.duration_s * 1e6 / interval_us)
+    count = int(min(course.duration_s, duration_max_s) * 1e6 / interval_us)
     record = FlightRecord(count + 1, PHASE_NAMES)
     tracker.begin(State(position, (0.0, 0.0, 0.0), quat_from_yaw(yaw), (0.0, 0.0, 0.0)))
     begin_s = airframe.t_us * 1e-6

@@ -119,7 +119,7 @@ def _vector(value: Any, unit: str) -> str:
 
 
 def adjustments(**changes: Any) -> Callable[[dict[str, Any]], None]:
-    """A function that sets values in a flight's data before validation; keys are paths with "__", None changes nothing."""
+    """A function that sets values in a flight's data before validation; keys are paths with "__", None is left out."""
 
     def adjust(data: dict[str, Any]) -> None:
         for key, value in changes.items():

@@ -16,9 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from companion.campaign.predict import gate_prediction
 from companion.config import Flight
 from companion.errors import CompanionError, ExitCode
 from companion.flight.preflight import gate_gains, gate_reference
+from companion.flight.tracker import kernels
 from companion.record.folder import create_flight_folder, write_configuration
 from companion.trajectory.load import of_flight
 
@@ -41,8 +43,10 @@ def prepare(flight: Flight, out: Path | None) -> Path:
     Raises:
         CompanionError: a gate refuses, or the folder cannot be written; nothing has connected yet.
     """
+    trajectory = of_flight(flight)
     gate_gains(flight.vehicle)
-    gate_reference(of_flight(flight), flight.vehicle)
+    gate_reference(trajectory, flight.vehicle)
+    gate_prediction(flight, trajectory, kernels("python"))
     folder = create_flight_folder(flight.name, out)
     write_configuration(folder, flight.model_dump(exclude_none=True))
     return folder

@@ -1,0 +1,149 @@
+"""CONFIG is a flight file, whose trajectory and start are predicted too, or a vehicle file. Exit code 3: refused."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from companion.cli.common import JsonOption, TimeScaleOption, say
+
+EXAMPLE = "Example: companion certify paper"
+
+
+def run(
+    config: Annotated[str, typer.Argument(help="Flight or vehicle file, or the name of a bundled one.")],
+    trajectory: Annotated[
+        str | None,
+        typer.Option("--trajectory", metavar="NAME", help="Predict this trajectory instead of the flight's."),
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--start", metavar="N,E,D", help="Predict from here instead of the flight's [start].")
+    ] = None,
+    time_scale: TimeScaleOption = None,
+    allow_uncertified: Annotated[
+        bool, typer.Option("--allow-uncertified", help="Predict and exit with 0 although the gains fail.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Prints certificate, margins and predicted extremes of a configuration."""
+    from companion.campaign.predict import Extreme, bounds, gate_prediction
+    from companion.control.certificate import certify
+    from companion.control.sampled import margins
+    from companion.errors import CompanionError, ExitCode
+    from companion.flight.preflight import gate_gains, timing
+    from companion.flight.tracker import kernels
+    from companion.trajectory.load import of_flight
+
+    flight = _flight(config, trajectory, start, time_scale)
+    vehicle = flight.vehicle
+    parameters = vehicle.parameters()
+    certificate = certify(parameters.gains, parameters.model.drag)
+    found = margins(parameters, timing(vehicle))
+    document: dict[str, Any] = {
+        "vehicle": vehicle.name,
+        "drag_1_s": parameters.model.drag,
+        "eigenvalues": {
+            "q_estimator_on": certificate.inside,
+            "q_estimator_off": certificate.inside_frozen,
+            "qr_estimator_on": certificate.outside,
+            "qr_estimator_off": certificate.outside_frozen,
+        },
+        "poles_1_s": [[pole.real, pole.imag] for pole in certificate.poles],
+        "sampled_loop": {
+            "interval_s": timing(vehicle).interval_s,
+            "delay_s": vehicle.delay_s,
+            "spectral_radius": found.spectral_radius,
+            "delay_margin_s": found.delay_margin_s,
+            "interval_max_s": found.interval_max_s,
+        },
+    }
+    refusal: str | None = None
+    try:
+        gate_gains(vehicle)
+        if flight.trajectory:
+            path = of_flight(flight)
+            low, high = bounds(flight, path)
+            document["thrust_bounds_n"] = {"low": low, "high": high}
+            prediction = gate_prediction(flight, path, kernels("python"))
+            document["predicted"] = {
+                name: value._asdict() if isinstance(value, Extreme) else value
+                for name, value in prediction._asdict().items()
+            }
+    except CompanionError as error:
+        refusal = str(error)
+    document["refused"] = refusal
+    if as_json:
+        print(json.dumps(document, indent=2))
+    else:
+        _print(document)
+    if refusal is not None and not allow_uncertified:
+        raise typer.Exit(int(ExitCode.REFUSED))
+
+
+def _flight(config: str, trajectory: str | None, start: str | None, time_scale: float | None) -> Any:
+    """The flight of a flight file; of a vehicle file one without a trajectory, unless one is given."""
+    from pathlib import Path
+
+    from companion.config import Start, build_flight, bundled_root, find, read_toml, validate
+    from companion.errors import InputError
+    from companion.trajectory.load import embedded
+
+    is_flight = (bundled_root() / "flights" / f"{config}.toml").is_file() or Path(config).is_file()
+    path = find(config, "flights" if is_flight else "vehicles")
+    data = read_toml(path)
+    if "vehicle" in data:
+        if trajectory is not None:
+            data["trajectory"] = trajectory
+        flight = build_flight(data, str(path))
+    else:
+        flight = build_flight({"name": path.stem, "vehicle": data, "trajectory": trajectory or ""}, str(path))
+    if start is not None:
+        try:
+            numbers = tuple(float(x) for x in start.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != 3:
+            raise InputError(f"--start {start!r}: expected three numbers north,east,down in metres")
+        flight = flight.model_copy(update={"start": validate(Start, {"position_m": numbers}, "--start")})
+    return embedded(flight, time_scale) if flight.trajectory else flight
+
+
+def _print(document: dict[str, Any]) -> None:
+    say(f"vehicle {document['vehicle']}, drag {document['drag_1_s']:g} 1/s")
+    say("eigenvalues (all must be above 0)")
+    for key, name in (
+        ("q_estimator_on", "Q   inside p_max, estimator on"),
+        ("q_estimator_off", "Q   inside p_max, estimator off"),
+        ("qr_estimator_on", "Qr  outside p_max, estimator on"),
+        ("qr_estimator_off", "Qr  outside p_max, estimator off"),
+    ):
+        say(f"  {name:34s} " + "  ".join(f"{x:8.4f}" for x in document["eigenvalues"][key]))
+    poles = ", ".join(f"{re:.3f}{im:+.3f}i" if im else f"{re:.3f}" for re, im in document["poles_1_s"])
+    say(f"poles of the linear loop [1/s]: {poles}")
+    loop = document["sampled_loop"]
+    say(f"sampled loop at {1.0 / loop['interval_s']:.0f} Hz with {loop['delay_s'] * 1e3:.0f} ms of delay")
+    say(f"  {'largest |eigenvalue|':34s} {loop['spectral_radius']:.5f} (below 1)")
+    say(f"  {'margin in delay':34s} {loop['delay_margin_s'] * 1e3:.1f} ms (at least 10 ms)")
+    say(f"  {'longest tolerable interval':34s} {loop['interval_max_s'] * 1e3:.0f} ms")
+    if "thrust_bounds_n" in document:
+        low, high = document["thrust_bounds_n"]["low"], document["thrust_bounds_n"]["high"]
+        silent = "; it says nothing here, the prediction decides" if low <= 0.0 else ""
+        say(f"thrust bounds (38): {low:.1f} to {high:.1f} N{silent}")
+    if "predicted" in document:
+        say("predicted for this trajectory and start (nominal loop, first seconds)")
+        names = {
+            "thrust_min_n": ("least thrust", "N"),
+            "thrust_max_n": ("greatest thrust", "N"),
+            "tilt_max_rad": ("greatest tilt", "rad"),
+            "rate_max_rad_s": ("greatest body rate", "rad/s"),
+            "torque_max_n_m": ("greatest torque", "N m"),
+            "error_max_m": ("greatest position error", "m"),
+        }
+        for key, (name, unit) in names.items():
+            extreme = document["predicted"][key]
+            say(f"  {name:34s} {extreme['value']:.2f} {unit} at {extreme['at_s']:.2f} s")
+        say(f"  {'thrust at a limit for':34s} {document['predicted']['thrust_limited_s']:.2f} s")
+        say(f"  {'a rate cut for':34s} {document['predicted']['rate_limited_s']:.2f} s")
+    say("certified" if document["refused"] is None else f"REFUSED: {document['refused']}")

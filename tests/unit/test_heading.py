@@ -1,0 +1,156 @@
+"""The free heading: w3d and w3d' against finite differences, the holds, the rate limit."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from law_cases import MASS, PAPER_GAINS, ZERO, eight, memory, numbers, parameters, vectors
+
+from companion.campaign.ideal import World, fly
+from companion.control import heading
+from companion.control.heading import COMMANDED, DAMPING, SIDESLIP, HeadingState, desired_frame, unit_derivatives
+from companion.control.law import ControllerState
+from companion.control.types import Reference, State
+from companion.control.vectors import axes, cross, dot, norm, quat_exp
+
+DOWN = ((0.0, 0.0, 1.0), ZERO, ZERO)
+
+
+def smooth(coefficients, t):
+    """A vector polynomial and its first two derivatives."""
+    a, b, c = (np.array(x) for x in coefficients)
+    return tuple(a + b * t + c * t * t), tuple(b + 2 * c * t), tuple(2 * c)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    force=st.tuples(vectors(2.0), vectors(2.0), vectors(2.0)),
+    forward=st.tuples(vectors(2.0), vectors(1.0), vectors(1.0)),
+)
+def test_yaw_rate_and_its_derivative_agree_with_finite_differences(force, forward):
+    force = (tuple(np.array(force[0]) + np.array([0.0, 0.0, 9.81])), force[1], force[2])
+
+    def frame(t):
+        f = smooth(force, t)
+        return desired_frame(unit_derivatives(*f), *smooth(forward, t))
+
+    if norm(cross(unit_derivatives(*smooth(force, 0.0))[0], smooth(forward, 0.0)[0])) < 0.3:
+        return
+    h = 1e-5
+    before, now, after = frame(-h), frame(0.0), frame(h)
+    r2_rate = (np.array(after.r2d) - np.array(before.r2d)) / (2 * h)
+    scale = 1.0 + abs(now.w3d) ** 2 + abs(now.w3d_rate)
+    assert np.array(now.r2d_rate) == pytest.approx(r2_rate, abs=1e-6 * scale)
+    assert now.w3d == pytest.approx(-np.dot(now.r1d, r2_rate), abs=1e-6 * scale)
+    assert now.w3d_rate == pytest.approx((after.w3d - before.w3d) / (2 * h), abs=1e-5 * scale)
+
+
+def level(yaw, w3=0.0):
+    return State(ZERO, ZERO, quat_exp((0.0, 0.0, yaw)), (0.0, 0.0, w3))
+
+
+def moving(v):
+    return Reference(ZERO, v, ZERO, ZERO, ZERO, 0.0, 0.0, 0.0)
+
+
+GRAVITY = ((0.0, 0.0, 9.81), ZERO, ZERO)
+GAINS = (1.0, 1.0, 2.0)
+
+
+@given(path=numbers(-3.1, 3.1), off=numbers(-3.0, 3.0))
+def test_sideslip_turns_the_nose_towards_the_path(path, off):
+    tau3, _, error = heading.heading_torque(
+        level(path + off),
+        moving((math.cos(path), math.sin(path), 0.0)),
+        GRAVITY,
+        memory(),
+        SIDESLIP,
+        GAINS,
+        (1.0, 0.1),
+        0.0,
+    )
+    assert error == pytest.approx(off, abs=1e-9)
+    assert tau3 == pytest.approx(-math.sin(off), abs=1e-9)  # -l2 l1 r2d . r1
+
+
+@given(yaw=numbers(-3.1, 3.1), off=numbers(-1.5, 1.5), rate=numbers(-1.0, 1.0), acceleration=numbers(-1.0, 1.0))
+def test_commanded_heading_feeds_rate_and_acceleration_forward(yaw, off, rate, acceleration):
+    ref = Reference(ZERO, ZERO, ZERO, ZERO, ZERO, yaw, rate, acceleration)
+    tau3, _, error = heading.heading_torque(level(yaw, rate), ref, GRAVITY, memory(), COMMANDED, GAINS, (9.0, 0.1), 0.0)
+    assert tau3 == pytest.approx(acceleration, abs=1e-9) and error == pytest.approx(0.0, abs=1e-9)
+    _, _, error = heading.heading_torque(level(yaw + off), ref, GRAVITY, memory(), COMMANDED, GAINS, (9.0, 0.1), 0.0)
+    assert error == pytest.approx(off, abs=1e-9)
+
+
+def test_damping_and_missing_thrust_direction_only_damp():
+    tau3, after, error = heading.heading_torque(
+        level(0.3, 0.5), moving((1.0, 0.0, 0.0)), GRAVITY, memory(), DAMPING, GAINS, (1.0, 0.1), 0.01
+    )
+    assert tau3 == -1.0 and after == memory() and math.isnan(error)
+    weak = ((0.0, 0.0, 0.1), ZERO, ZERO)
+    tau3, after, _ = heading.heading_torque(
+        level(0.3, 0.5), moving((1.0, 0.0, 0.0)), weak, memory(), SIDESLIP, GAINS, (1.0, 0.1), 0.01
+    )
+    assert tau3 == -1.0 and after == memory()
+
+
+def test_slow_path_holds_the_last_direction_with_hysteresis():
+    """Held below 0.3 m/s, left at 0.6 m/s; a vertical climb has speed and no direction."""
+    m = memory()
+    east = HeadingState((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), False)
+    _, m, error = heading.heading_torque(
+        level(math.pi / 2), moving((0.0, 0.2, -3.0)), GRAVITY, east, SIDESLIP, GAINS, (9.0, 0.3), 0.01
+    )
+    assert m.held and m.forward == pytest.approx((0.0, 1.0, 0.0)) and error == pytest.approx(0.0)
+    _, m, error = heading.heading_torque(
+        level(math.pi / 2), moving((0.5, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01
+    )
+    assert m.held and error == pytest.approx(0.0)
+    _, m, _ = heading.heading_torque(
+        level(math.pi / 2), moving((0.7, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01
+    )
+    assert not m.held
+    _, m, _ = heading.heading_torque(level(0.0), moving((0.4, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01)
+    assert not m.held
+
+
+@pytest.mark.parametrize("target", [1.0, -2.5, 3.1])
+def test_the_rate_limit_turns_the_direction_no_faster_and_the_shorter_way(target):
+    m, state, limit, dt = memory(), level(0.0), 0.5, 0.02
+    ref = moving((math.cos(target), math.sin(target), 0.0))
+    angle, steps = 0.0, 0
+    while abs(angle - target) > 1e-9 and steps < 1000:
+        _, m, _ = heading.heading_torque(state, ref, GRAVITY, m, SIDESLIP, GAINS, (limit, 0.1), dt)
+        new = math.atan2(-m.r2d[0], m.r2d[1])
+        assert abs(new - angle) <= limit * dt + 1e-12
+        assert (new - angle) * target >= 0.0
+        angle, steps = new, steps + 1
+    assert steps == math.ceil(abs(target) / (limit * dt))
+
+
+def test_nose_backwards_is_an_equilibrium_left_as_45_says():
+    """eta = 1 - r2d . r2 obeys eta' = -l1 (2 - eta) eta once xi = 0: integrated from near 2 in the closed loop."""
+    p = parameters(PAPER_GAINS._replace(heading_kind=COMMANDED))
+    hover = Reference((0.0, 0.0, -10.0), ZERO, ZERO, ZERO, ZERO, 0.0, 0.0, 0.0)
+    off = math.pi - 0.05
+    # xi = w3 - w3d + l1 r2d . r1 = 0 at the start
+    start = State((0.0, 0.0, -10.0), ZERO, quat_exp((0.0, 0.0, off)), (0.0, 0.0, -math.sin(off)))
+    ctrl = ControllerState(MASS * 9.81, 0.0, ZERO, memory(), ZERO)
+    times = np.linspace(0.0, 8.0, 41)
+    flight = fly(lambda t: hover, start, ctrl, p, World(ZERO, 9.81, 0.0), times)
+    eta0 = 1.0 - math.cos(off)
+    for t, s in zip(times, flight, strict=True):
+        eta = 1.0 - dot((0.0, 1.0, 0.0), axes(s.state.q)[1])
+        growth = eta0 / (2.0 - eta0) * math.exp(-2.0 * t)
+        assert eta == pytest.approx(2.0 * growth / (1.0 + growth), abs=1e-6)
+
+
+def test_in_the_papers_flight_the_heading_follows_the_path_not_the_velocity():
+    p = parameters()
+    start = State((0.0, 0.0, -10.0), (0.0, 1.0, 0.0), quat_exp((0.0, 0.0, 1.4)), ZERO)
+    ctrl = ControllerState(MASS * 9.81, 0.0, ZERO, memory(), ZERO)
+    flight = fly(eight, start, ctrl, p, World(ZERO, 9.81, 0.0), np.arange(0.0, 15.0, 0.5))
+    assert abs(flight[0].evaluation.heading_error) > 0.15
+    assert abs(flight[-1].evaluation.heading_error) < 1e-4
