@@ -12,14 +12,14 @@ from enum import IntEnum
 from .codec import ActuatorControls, AttitudeTarget
 from .failsafe import Action, Cause, Decision, Health, decide
 from .guidance import Guidance
-from .inner_loops import ATTITUDE, RATES, STOPPED_SETPOINT, Setpoint
+from .inner_loops import ATTITUDE, STOPPED_SETPOINT, Setpoint
 from .land_detector import LandDetector, Motion
 from .modes import Mode
 from .offboard import Offboard, Order
 from .parameters import Parameters
 from .physics import RigidState
-from .position_loop import PositionParameters, initial_position_state, position_control
-from .rotation import Quat, Vec3
+from .rotation import Vec3, yaw_of
+from .steering import IDLE, Steering, centred
 from .watch import DisarmTimer, TiltWatch
 
 HEALTH_PERIOD_US = 100_000
@@ -32,7 +32,6 @@ _LONG_AGO_US = 60_000_000
 EMERGENCY, CRITICAL, WARNING, NOTICE, INFO = 0, 2, 4, 5, 6
 """MAV_SEVERITY"""
 
-_IDLE = Setpoint(RATES, 0.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), math.nan, (0.0, 0.0, 0.0))
 _RATE_OR_LEVEL = (Mode.STABILIZED, Mode.MANUAL, Mode.ACRO)
 
 
@@ -92,10 +91,7 @@ class Autopilot:
         self._lost_us: dict[Cause, int] = {}
         self._disarm_timer = DisarmTimer(parameters)
         self._tilt = TiltWatch(parameters)
-        self._position_state = initial_position_state(rigid.v)
-        self._position_parameters = PositionParameters()
-        self._position_version = -1
-        self._guided = False
+        self._steering = Steering(parameters)
         self.guidance.enter(Mode.HOLD, rigid.p, rigid.v, yaw_of(rigid.q), rigid.p)
 
     # Requests
@@ -260,19 +256,17 @@ class Autopilot:
 
     def _order(self, rigid: RigidState, dt_s: float) -> Order:
         """Give the setpoint of the mode in charge."""
-        guided = False
         if not self.armed or self.terminated:
             order = Order(STOPPED_SETPOINT, False)
         elif self.mode is Mode.OFFBOARD:
             order = self.offboard.order(self._now_us, self.held)
         elif self.mode in _RATE_OR_LEVEL:
-            order = Order(_IDLE if self.land.landed else self._centred(rigid.q), True)
+            order = Order(IDLE if self.land.landed else centred(self.mode, rigid.q, self.parameters), True)
         elif self._stays_on_ground():
-            order = Order(_IDLE, False)
+            order = Order(IDLE, False)
         else:
-            guided = True
-            order = Order(self._steer(rigid, dt_s), True)
-        self._guided = guided
+            return Order(self._steering.setpoint(self.guidance, rigid, dt_s), True)
+        self._steering.rest()
         return order
 
     def _stays_on_ground(self) -> bool:
@@ -280,28 +274,6 @@ class Autopilot:
         if self.guidance.wants_to_fly():
             return (self._now_us - self._armed_us) * 1e-6 < self.parameters.number("COM_SPOOLUP_TIME")
         return self.land.landed or (self.guidance.descending and self.land.ground_contact)
-
-    def _steer(self, rigid: RigidState, dt_s: float) -> Setpoint:
-        """Run the flight task and the position controller."""
-        if not self._guided:
-            self._position_state = initial_position_state(rigid.v)
-        if self._position_version != self.parameters.version:
-            self._position_version = self.parameters.version
-            self._position_parameters = position_parameters(self.parameters)
-        target = self.guidance.setpoint(rigid.p, rigid.v, dt_s)
-        setpoint, self._position_state = position_control(
-            rigid.p, rigid.v, rigid.q, target, self._position_state, self._position_parameters, dt_s
-        )
-        return setpoint
-
-    def _centred(self, q: Quat) -> Setpoint:
-        """Give what centred sticks mean: level or no rotation, at the hover thrust. Nobody holds the position."""
-        thrust = self.parameters.number("MPC_THR_HOVER")
-        if self.mode is Mode.ACRO:
-            return Setpoint(RATES, thrust, (0.0, 0.0, 0.0), q, math.nan, (0.0, 0.0, 0.0))
-        yaw = yaw_of(q)
-        level = (math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0))
-        return Setpoint(ATTITUDE, thrust, (0.0, 0.0, 0.0), level, math.nan, (0.0, 0.0, 0.0))
 
     # Failsafe and arming
 
@@ -397,25 +369,3 @@ class Autopilot:
     def _say(self, severity: int, sentence: str) -> None:
         """Queue a STATUSTEXT."""
         self.texts.append((severity, sentence))
-
-
-_POSITION_RANGES = {
-    "MPC_XY_VEL_P_ACC": (0.1, 20.0),
-    "MPC_TILTMAX_AIR": (1.0, 85.0),
-    "MPC_THR_MIN": (0.01, 0.5),
-    "MPC_THR_MAX": (0.5, 1.0),
-    "MPC_THR_HOVER": (0.1, 0.8),
-}
-"""Nobody checks the range of a PARAM_SET; the controller limits what it could not compute with. Others: 0 to 1000."""
-
-
-def position_parameters(parameters: Parameters) -> PositionParameters:
-    """Give the position controller's parameters, limited to what it can compute with."""
-    names = PositionParameters._fields
-    return PositionParameters(*(parameters.within(name, *_POSITION_RANGES.get(name, (0.0, 1000.0))) for name in names))
-
-
-def yaw_of(q: Quat) -> float:
-    """Give the heading [rad] of an attitude."""
-    w, x, y, z = q
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

@@ -17,7 +17,7 @@ from .estimator import Estimate
 from .geodesy import global_position
 from .modes import FLAG_ARMED, Mode
 from .parameters import Parameters
-from .rotation import Vec3
+from .rotation import Vec3, yaw_of
 from .vehicle_file import VehicleFile
 
 _LOCAL_NED = 1
@@ -135,7 +135,7 @@ class Telemetry:
         """GLOBAL_POSITION_INT."""
         e = self._estimate
         latitude, longitude, altitude_m = global_position(e.p)
-        heading = math.degrees(math.atan2(2.0 * (e.q[0] * e.q[3] + e.q[1] * e.q[2]), _cos_yaw(e.q))) % 360.0
+        heading = math.degrees(yaw_of(e.q)) % 360.0
         above_home_m = self._autopilot.guidance.home[2] - e.p[2]
         speeds = [_int16(100.0 * x) for x in e.v]
         return codec.GLOBAL_POSITION_INT.pack(
@@ -270,11 +270,6 @@ def truth_payload(t_us: int, p: Vec3, v: Vec3, q: tuple[float, ...], w: Vec3, ac
         airspeed,
         *(_int16(1000.0 * x / _STANDARD_G) for x in acceleration),
     )
-
-
-def _cos_yaw(q: tuple[float, ...]) -> float:
-    """Give the cosine part of the heading."""
-    return 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3])
 
 
 def _int16(value: float) -> int:

@@ -26,7 +26,8 @@ _HEARTBEAT_WALL_S = 0.2
 """Between heartbeats while the clock stands still and waits for the first companion."""
 _SLICE_S = 0.1
 """Longest single wait, so that a stop is noticed."""
-_SPIN_S = float(__import__("os").environ.get("SPIN","0"))
+_SPIN_S = 2.0e-4
+"""Wall time for which an answer is polled for before the process sleeps: waking up takes longer than most answers."""
 _LATE_MAX_S = 0.25
 """Of lateness so much is caught up with; the rest is let go."""
 
@@ -127,17 +128,18 @@ class Peer:
         vehicle = self.vehicle
         vehicle.tick()
         self._ticked_s = time.monotonic()
-        if self._truth_log is not None:
-            self._truth_log.write(vehicle.airframe.truth())
         if self.options.lockstep:
             self._awaited_ns = vehicle.t_us * 1000
             self._answered = False
             vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._awaited_ns, 0, 0))
         self._flush()
+        over = True
         if self.synchronous:
-            self._wait_for_answer()
+            over = self._wait_for_answer()
         else:
             self._wait_for_time()
+        if self._truth_log is not None and over:
+            self._truth_log.write(vehicle.airframe.truth())
 
     def close(self) -> None:
         """Close the sockets and complete the truth file."""
@@ -168,13 +170,16 @@ class Peer:
                     return True
         return False
 
-    def _wait_for_answer(self) -> None:
-        """Act on what comes until the companion has answered this state, for a bounded time."""
+    def _wait_for_answer(self) -> bool:
+        """Act on what comes until the companion has answered this state, for a bounded time. False: stopped before.
+
+        A state that was never answered is left out of the truth file, so that the file does not depend on when exactly
+        the companion ended the vehicle.
+        """
         while self._waiting and not self._answered:
             self._act(*self._waiting.popleft())
         give_up_s = self._ticked_s + PATIENCE_S
-        spin_s = time.monotonic() + _SPIN_S
-        while not self._answered and time.monotonic() < spin_s:
+        while not self._answered and time.monotonic() < self._ticked_s + _SPIN_S:
             self._read_companion()
         while not self._answered:
             left_s = give_up_s - time.monotonic()
@@ -183,10 +188,12 @@ class Peer:
                 self._deadline_s = time.monotonic()
                 self._notice(f"no answer from the companion for {PATIENCE_S:g} s: going on at real time")
                 break
-            if self._stopped():
-                break
-            self._serve(min(left_s, _SLICE_S))
+            stopped = self._stopped()
+            self._serve(0.0 if stopped else min(left_s, _SLICE_S))
+            if stopped and not self._answered:
+                return False
         self._flush()
+        return True
 
     def _wait_for_time(self) -> None:
         """Act on what comes until the wall clock has caught up with the vehicle's."""

@@ -70,7 +70,7 @@ def extremes(trace: Trace, vehicle: Vehicle) -> Prediction:
         _largest([tilt_from_quat(row.state.q) for row in rows], times),
         _largest([max(abs(x) for x in row.state.w) for row in rows], times),
         _largest(torques, times),
-        _largest([norm(row.errors.e1) for row in rows], times),
+        _largest([norm(row.errors[0]) for row in rows], times),
         float((flags & (LIMIT_THRUST_MIN | LIMIT_THRUST_MAX) != 0).sum()) * interval,
         float((flags & (LIMIT_RATE_ROLL_PITCH | LIMIT_RATE_YAW) != 0).sum()) * interval,
     )

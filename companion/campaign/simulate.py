@@ -18,15 +18,18 @@ import numpy as np
 
 from companion.campaign import ideal
 from companion.config import Flight
+from companion.control import flat
 from companion.control.heading import HeadingState
-from companion.control.law import ControllerState, Errors
+from companion.control.law import ControllerState
 from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, Setpoint
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.errors import InputError, RefusedError
 from companion.flight.course import Course
 from companion.flight.phases import PHASE_INDEX, PHASE_NAMES, Phase
-from companion.flight.tracker import Kernels, Tracker
+from companion.flight.rows import StepTiming, control_row
+from companion.flight.tracker import Kernels, Tracker, TrackerStep
 from companion.frames import quat_from_yaw, radians
+from companion.link.telemetry import VehicleState
 from companion.record.flight_record import FlightRecord
 from companion.record.summary import FlightMeta, PhaseChange, summarise
 from companion.trajectory.anchored import Trajectory
@@ -41,6 +44,7 @@ CSV_COLUMNS = (
 )
 
 DIVERGED_M = 1e4
+NO_TIMING = StepTiming(math.nan, math.nan, False, 0)
 
 
 class Row(NamedTuple):
@@ -52,13 +56,14 @@ class Row(NamedTuple):
     thrust_rate_n_s: float
     tau: Vec3
     b_hat: Vec3
-    errors: Errors
+    errors: tuple[Vec3, Vec3, Vec3, Vec3]
+    """e1 to e4 [m]."""
 
     def numbers(self) -> tuple[float, ...]:
         """The row in the order of CSV_COLUMNS."""
         s, e = self.state, self.errors
         head = (self.t_s, *s.p, *s.v, *s.q, *s.w, self.thrust_n, self.thrust_rate_n_s, *self.tau, *self.b_hat)
-        return (*head, *e.e1, *e.e2, *e.e3, *e.e4)
+        return (*head, *e[0], *e[1], *e[2], *e[3])
 
 
 @dataclass
@@ -171,8 +176,8 @@ def fly_sampled(
         state = State(believed.p, believed.v, believed.q, believed.w)
         out = tracker.step(stamp_s, state, lambda t: course.at(t - begin_s))
         queue.append((airframe.t_us + delay_us, loop_setpoint(out.setpoint)))
-        _append(record, rows, tracker, out, stamp_s, stamp_s - begin_s, state, course)
-        size = math.hypot(*out.errors.e1)
+        _append(record, rows, out, stamp_s, stamp_s - begin_s, state, course)
+        size = math.hypot(*out.errors[0])
         if not size < DIVERGED_M:
             at_s = stamp_s - begin_s
             raise RefusedError(f"the simulated flight diverges: position error {size:.3g} m at {at_s:.2f} s")
@@ -199,8 +204,7 @@ def _hover(flight: Flight) -> Setpoint:
 def _append(
     record: FlightRecord,
     rows: list[Row],
-    tracker: Tracker,
-    out: Any,
+    out: TrackerStep,
     stamp_s: float,
     t: float,
     state: State,
@@ -211,15 +215,10 @@ def _append(
     track = t - course.join_s
     on_track = 0.0 <= track <= course.track_s
     phase = Phase.TRACK if on_track else (Phase.JOIN if track < 0.0 else Phase.HOLD)
-    c = tracker.controller
-    rows.append(Row(t, state, c.thrust, c.thrust_rate, out.command.tau, c.b_hat, out.errors))
-    e = out.errors
-    record.append(
-        (stamp_s, track if on_track else math.nan, PHASE_INDEX[phase], *state.p, *state.v, *state.q, *state.w)
-        + (*reference.p, *reference.v, *error, out.heading_error, *e.e1, *e.e2, *e.e3, *e.e4)
-        + (tracker.lyapunov(e), *c.b_hat, c.thrust, c.thrust_rate, *out.command.tau, *out.command.rates)
-        + (out.setpoint.thrust, math.nan, math.nan, 0.0, 0.0, float(out.command.limits))
-    )
+    n = out.numbers
+    rows.append(Row(t, state, n[flat.TOTAL], n[flat.TOTAL_RATE], out.tau, out.b_hat, out.errors))
+    seen = VehicleState(round(stamp_s * 1e6), *state, 0)
+    record.append(control_row(track if on_track else math.nan, phase, seen, reference, error, out, NO_TIMING))
 
 
 def fly_ideal(flight: Flight, trajectory: Trajectory, progress: Callable[[float], None] = lambda share: None) -> Trace:
@@ -257,7 +256,7 @@ def fly_ideal(flight: Flight, trajectory: Trajectory, progress: Callable[[float]
     rows = []
     for s in samples:
         c, ev, ref = s.controller, s.evaluation, s.reference
-        rows.append(Row(s.t_s, s.state, c.thrust, c.thrust_rate, ev.tau, c.b_hat, ev.errors))
+        rows.append(Row(s.t_s, s.state, c.thrust, c.thrust_rate, ev.tau, c.b_hat, ev.errors[:4]))
         record.append(_ideal_row(s, ref, course, parameters))
     phases = [PhaseChange(Phase.TRACK.value, course.join_s, "simulated in the paper's ideal setting")]
     meta = FlightMeta(trajectory.name, vehicle.name, 0, flight.statistics_from_s, flight.acceptance.thresholds())

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.errors import ExitCode
-
 if TYPE_CHECKING:
     from companion.flight.launch import Flown
 
@@ -78,6 +76,9 @@ def report_flight(flown: Flown, *, as_json: bool) -> int:
 
     if not (flown.folder / SUMMARY_FILE).exists():
         say(f"companion: {flown.sentence}", quiet=True)
+        if as_json:
+            outcome = {"ended": flown.sentence, "folder": str(flown.folder), "exit_code": flown.exit_code}
+            print(json.dumps(outcome, indent=2))
         return flown.exit_code
     summary = read_summary(flown.folder)
     page = build_report(flown.folder)
@@ -87,8 +88,6 @@ def report_flight(flown: Flown, *, as_json: bool) -> int:
     say(f"{flown.sentence}; {summary['steps']} control steps at {_figure(summary['control_rate_hz'], 'Hz', 0)}")
     print_summary(summary)
     say(f"report:  {page}")
-    if flown.exit_code == ExitCode.INTERRUPTED:
-        say("interrupted: the vehicle was handed over to its Hold mode", quiet=True)
     return flown.exit_code
 
 

@@ -3,6 +3,7 @@ this machine allows, and the same for the same seed."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
@@ -20,6 +21,7 @@ from companion.cli.common import (
     vehicle_changes,
 )
 
+CONNECT_TIMEOUT_S = 15.0
 EXAMPLE = "Example: companion demo --output attitude --out my-first-flight"
 
 
@@ -39,11 +41,16 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Flies the demo and leaves a flight folder with report.html."""
+    from companion.accelerate import resolve
     from companion.config import load_flight
-    from companion.flight.bundled import BundledVehicle
+    from companion.errors import InputError
+    from companion.flight.bundled import PX4_VERSIONS, BundledVehicle
     from companion.flight.launch import control, prepare
     from companion.trajectory.load import embedded
 
+    resolve(engine)
+    if px4 is not None and px4 not in PX4_VERSIONS:
+        raise InputError(f"--px4 {px4!r}: allowed are {', '.join(PX4_VERSIONS)}")
     changes: dict[str, Any] = {
         **vehicle_changes(vehicle),
         "output__kind": output,
@@ -56,5 +63,11 @@ def run(
     with BundledVehicle(configured, folder, px4=version, engine=engine, lockstep=not real_time) as bundled:
         say(f"the bundled vehicle ({configured.vehicle.name}) waits in Hold; flight folder {folder}", quiet=as_json)
         with FlightDisplay(quiet=as_json) as display:
-            flown = control(folder, bundled.connection, engine, 15.0, display)
+
+            def listen(message: Mapping[str, Any]) -> None:
+                display(message)
+                if "flown" in message:  # it would wait for a companion that has gone
+                    bundled.stop()
+
+            flown = control(folder, bundled.connection, engine, CONNECT_TIMEOUT_S, listen)
     raise typer.Exit(report_flight(flown, as_json=as_json))

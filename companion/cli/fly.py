@@ -6,6 +6,7 @@ Without --flight the vehicle file says everything: gains, limits, rates + thrust
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Annotated, Any
 
 import typer
@@ -44,13 +45,19 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Flies the trajectory and leaves a flight folder."""
+    from companion.accelerate import resolve
     from companion.config import build_flight, find, load_flight
     from companion.errors import InputError
     from companion.flight.launch import control, prepare
+    from companion.link.transport import parse_connection
     from companion.trajectory.load import embedded
 
     if flight is None and vehicle is None:
         raise InputError("say which vehicle this is: --vehicle NAME (a vehicle file), or --flight NAME (a flight file)")
+    if not (isfinite(timeout) and timeout > 0.0):
+        raise InputError(f"--timeout {timeout:g}: must be a number of seconds above 0")
+    resolve(engine)
+    parse_connection(connect)
     path = find(trajectory, "trajectories")
     changes: dict[str, Any] = {"trajectory": trajectory, "output__kind": output, "after": "land" if land else None}
     if flight is None:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from companion.control.heading import HeadingState, heading_torque
 from companion.control.types import Quat, Reference, State, Vec3
-from companion.control.vectors import axes, clip, cross, dot, norm
+from companion.control.vectors import axes, cross, dot, norm
 
 LIMIT_THRUST_MIN = 1
 LIMIT_THRUST_MAX = 2
@@ -251,7 +251,14 @@ def error_rates(e: Errors, e1_rate: Vec3, b_hat_rate: Vec3, gains: Gains, drag: 
 
 
 def thrust_and_torque(
-    e: Errors, b_hat_rate: Vec3, state: State, ref: Reference, thrust: float, thrust_rate: float, parameters: Parameters
+    e: Errors,
+    b_hat_rate: Vec3,
+    body: tuple[Vec3, Vec3, Vec3],
+    w: Vec3,
+    ref: Reference,
+    thrust: float,
+    thrust_rate: float,
+    parameters: Parameters,
 ) -> tuple[float, float, float]:
     """T'', tau1, tau2 from equations (19), (34), (20).
 
@@ -266,8 +273,8 @@ def thrust_and_torque(
     c1 = c0 / ks
     k_sum = ks + gains.k4
     d = model.drag
-    r1, r2, r3 = axes(state.q)
-    w1, w2, w3 = state.w
+    r1, r2, r3 = body
+    w1, w2, w3 = w
     # S(w) (S(w) T u3 + 2 T' u3) of (19), in body coordinates, where S(w) u3 = (w2, -w1, 0); its factor c1/m cancels in
     # (34)
     gyro = (
@@ -303,6 +310,7 @@ def evaluate(
         dt_s: sample interval for the heading's rate limit [s]; 0 for the continuous form, which has none.
     """
     gains, model, limits = parameters.gains, parameters.model, parameters.limits
+    body = axes(state.q)
     e = errors(state, ref, controller.thrust, controller.thrust_rate, controller.b_hat, gains, model)
     b_hat_rate = (0.0, 0.0, 0.0)
     b_hat_acceleration = (0.0, 0.0, 0.0)
@@ -316,7 +324,7 @@ def evaluate(
             gains.gamma * (e2r[2] + e3r[2] + e4r[2]),
         )
     thrust_acceleration, tau1, tau2 = thrust_and_torque(
-        e, b_hat_rate, state, ref, controller.thrust, controller.thrust_rate, parameters
+        e, b_hat_rate, body, state.w, ref, controller.thrust, controller.thrust_rate, parameters
     )
     b, d = controller.b_hat, model.drag
     # F/m = g u3 + b_hat - q2 and its derivatives: the direction that the thrust will have with no error (41)
@@ -344,6 +352,7 @@ def evaluate(
         (gains.l1, gains.l2, gains.damping),
         (limits.heading_rate_max, limits.heading_speed_min),
         dt_s,
+        body,
     )
     return Evaluation(e, b_hat_rate, thrust_acceleration, (tau1, tau2, tau3), heading, heading_error)
 
@@ -394,41 +403,42 @@ def step(
         thrust = limits.thrust_max
         thrust_rate = min(0.0, thrust_rate)
         flags |= LIMIT_THRUST_MAX
-    b = controller.b_hat
-    b_hat = (b[0] + dt_s * out.b_hat_rate[0], b[1] + dt_s * out.b_hat_rate[1], b[2] + dt_s * out.b_hat_rate[2])
-    size = norm(b_hat)
-    if size > limits.disturbance_max:  # the last of the discretisation: the smooth projection has done the rest
-        shrink = limits.disturbance_max / size
-        b_hat = (shrink * b_hat[0], shrink * b_hat[1], shrink * b_hat[2])
-    if size > (1.0 - PROJECTION_LAYER) * limits.disturbance_max:
+    b, b_rate = controller.b_hat, out.b_hat_rate
+    b_hat = (b[0] + dt_s * b_rate[0], b[1] + dt_s * b_rate[1], b[2] + dt_s * b_rate[2])
+    size_sq = b_hat[0] * b_hat[0] + b_hat[1] * b_hat[1] + b_hat[2] * b_hat[2]
+    bound = limits.disturbance_max
+    if size_sq > (1.0 - PROJECTION_LAYER) ** 2 * bound * bound:
         flags |= LIMIT_DISTURBANCE
-
-    x = rate_setpoint(state.w[0], out.tau[0], model.rate_lag[0], dt_s)
-    y = rate_setpoint(state.w[1], out.tau[1], model.rate_lag[1], dt_s)
-    z = rate_setpoint(state.w[2], out.tau[2], model.rate_lag[2], dt_s)
-    over = max(abs(x) / limits.rate_max[0], abs(y) / limits.rate_max[1])
-    if over > 1.0:
+        if size_sq > bound * bound:  # the last of the discretisation: the smooth projection has done the rest
+            shrink = bound / math.sqrt(size_sq)
+            b_hat = (shrink * b_hat[0], shrink * b_hat[1], shrink * b_hat[2])
+    w, tau, lag, most = state.w, out.tau, model.rate_lag, limits.rate_max
+    x = rate_setpoint(w[0], tau[0], lag[0], dt_s)
+    y = rate_setpoint(w[1], tau[1], lag[1], dt_s)
+    z = rate_setpoint(w[2], tau[2], lag[2], dt_s)
+    if abs(x) > most[0] or abs(y) > most[1]:
+        over = max(abs(x) / most[0], abs(y) / most[1])
         x, y = x / over, y / over
         flags |= LIMIT_ROLL_PITCH_RATE
-    if abs(z) > limits.rate_max[2]:
-        z = clip(z, -limits.rate_max[2], limits.rate_max[2])
+    if abs(z) > most[2]:
+        z = math.copysign(most[2], z)
         flags |= LIMIT_YAW_RATE
     lead, k = controller.lead_integral, model.rate_integral
     rates = (
-        clip(x - k[0] * lead[0], -limits.rate_max[0], limits.rate_max[0]),
-        clip(y - k[1] * lead[1], -limits.rate_max[1], limits.rate_max[1]),
-        clip(z - k[2] * lead[2], -limits.rate_max[2], limits.rate_max[2]),
+        min(max(x - k[0] * lead[0], -most[0]), most[0]),
+        min(max(y - k[1] * lead[1], -most[1]), most[1]),
+        min(max(z - k[2] * lead[2], -most[2]), most[2]),
     )
     # The autopilot integrates every lead w_cmd - w. All of it must not be taken back out: what a constant torque
     # disturbance leaves is the integral's own business, so the memory fades.
     lead = (
-        lead[0] + dt_s * (x - state.w[0] - (k[0] + LEAD_FADE_1_S) * lead[0]),
-        lead[1] + dt_s * (y - state.w[1] - (k[1] + LEAD_FADE_1_S) * lead[1]),
-        lead[2] + dt_s * (z - state.w[2] - (k[2] + LEAD_FADE_1_S) * lead[2]),
+        lead[0] + dt_s * (x - w[0] - (k[0] + LEAD_FADE_1_S) * lead[0]),
+        lead[1] + dt_s * (y - w[1] - (k[1] + LEAD_FADE_1_S) * lead[1]),
+        lead[2] + dt_s * (z - w[2] - (k[2] + LEAD_FADE_1_S) * lead[2]),
     )
     # the same inversion for the rotors' lag: the setpoint that brings the thrust to T at the end of the interval
     ahead = rate_setpoint(controller.thrust, (thrust - controller.thrust) / dt_s, model.thrust_lag, dt_s)
-    command = Command(clip(ahead, limits.thrust_min, limits.thrust_max), rates, (x, y, z), out.tau, flags)
+    command = Command(min(max(ahead, limits.thrust_min), limits.thrust_max), rates, (x, y, z), tau, flags)
     return command, ControllerState(thrust, thrust_rate, b_hat, out.heading, lead), out
 
 

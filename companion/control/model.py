@@ -10,17 +10,38 @@ from __future__ import annotations
 
 import math
 
-from companion.control.types import Quat, State, Vec3
-from companion.control.vectors import axes, quat_exp, quat_multiply, quat_normalise
+from companion.control.types import State, Vec3
+from companion.control.vectors import quat_exp, quat_multiply, quat_normalise
+
+Lags = tuple[float, float, float, float]
+"""Time constants of roll, pitch, yaw rate and thrust behind their setpoints [s]."""
+Factors = tuple[float, float, float, float, float, float, float, float]
 
 
 def lagged(x: float, setpoint: float, lag_s: float, dt_s: float) -> tuple[float, float]:
     """A first-order lag after dt, and its mean over dt."""
-    if lag_s <= 0.0:
-        return setpoint, setpoint
-    decay = math.exp(-dt_s / lag_s)
+    decay, share = lag_factors(lag_s, dt_s)
     gap = x - setpoint
-    return setpoint + gap * decay, setpoint + gap * (1.0 - decay) * lag_s / dt_s
+    return setpoint + gap * decay, setpoint + gap * share
+
+
+def lag_factors(lag_s: float, dt_s: float) -> tuple[float, float]:
+    """What is left of a gap after dt, and on average over dt."""
+    if lag_s <= 0.0:
+        return 0.0, 0.0
+    decay = math.exp(-dt_s / lag_s)
+    return decay, (1.0 - decay) * lag_s / dt_s
+
+
+def factors(lags: Lags, dt_s: float) -> Factors:
+    """`lag_factors` of roll, pitch, yaw rate and thrust, one after the other."""
+    x, y, z, t = (
+        lag_factors(lags[0], dt_s),
+        lag_factors(lags[1], dt_s),
+        lag_factors(lags[2], dt_s),
+        lag_factors(lags[3], dt_s),
+    )
+    return (x[0], x[1], y[0], y[1], z[0], z[1], t[0], t[1])
 
 
 def advance(
@@ -30,7 +51,7 @@ def advance(
     thrust_setpoint: float,
     b_hat: Vec3,
     vehicle: tuple[float, float, float],
-    lags: tuple[float, float, float, float],
+    lags: Factors,
     dt_s: float,
 ) -> tuple[State, float]:
     """The vehicle dt later, under one command.
@@ -42,32 +63,34 @@ def advance(
         thrust_setpoint: commanded thrust [N].
         b_hat: disturbance estimate, NED [m/s^2].
         vehicle: mass [kg], gravity [m/s^2], drag [1/s].
-        lags: of roll, pitch, yaw rate and thrust [s].
+        lags: `factors` for this dt.
         dt_s: above zero [s].
 
     Returns:
         the state and the thrust at the end; second order in dt.
     """
     mass, gravity, drag = vehicle
-    w, v = state.w, state.v
-    x, x_mean = lagged(w[0], rates[0], lags[0], dt_s)
-    y, y_mean = lagged(w[1], rates[1], lags[1], dt_s)
-    z, z_mean = lagged(w[2], rates[2], lags[2], dt_s)
-    end_thrust, mean_thrust = lagged(thrust, thrust_setpoint, lags[3], dt_s)
-    q: Quat = quat_normalise(quat_multiply(state.q, quat_exp((x_mean * dt_s, y_mean * dt_s, z_mean * dt_s))))
-    before, after = axes(state.q)[2], axes(q)[2]
-    half = 0.5 * mean_thrust / mass
-    a0 = b_hat[0] - drag * v[0] - half * (before[0] + after[0])
-    a1 = b_hat[1] - drag * v[1] - half * (before[1] + after[1])
-    a2 = b_hat[2] - drag * v[2] - half * (before[2] + after[2]) + gravity
-    h = 0.5 * dt_s * dt_s
-    p = state.p
-    return (
-        State(
-            (p[0] + dt_s * v[0] + h * a0, p[1] + dt_s * v[1] + h * a1, p[2] + dt_s * v[2] + h * a2),
-            (v[0] + dt_s * a0, v[1] + dt_s * a1, v[2] + dt_s * a2),
-            q,
-            (x, y, z),
-        ),
-        end_thrust,
+    v, p = state.v, state.p
+    # body rates and thrust: where the lag brings them, and their means on the way
+    x, y, z = state.w[0] - rates[0], state.w[1] - rates[1], state.w[2] - rates[2]
+    gap = thrust - thrust_setpoint
+    turn = (
+        dt_s * (rates[0] + x * lags[1]),
+        dt_s * (rates[1] + y * lags[3]),
+        dt_s * (rates[2] + z * lags[5]),
     )
+    w = (rates[0] + x * lags[0], rates[1] + y * lags[2], rates[2] + z * lags[4])
+    half = 0.5 * (thrust_setpoint + gap * lags[7]) / mass
+    a, b, c, d = state.q
+    e, f, g, h = quat_normalise(quat_multiply(state.q, quat_exp(turn)))
+    # the sum of the thrust directions r3 at both ends
+    north = 2.0 * (b * d + a * c + f * h + e * g)
+    east = 2.0 * (c * d - a * b + g * h - e * f)
+    down = 2.0 - 2.0 * (b * b + c * c + f * f + g * g)
+    a0 = b_hat[0] - drag * v[0] - half * north
+    a1 = b_hat[1] - drag * v[1] - half * east
+    a2 = b_hat[2] - drag * v[2] - half * down + gravity
+    k = 0.5 * dt_s * dt_s
+    position = (p[0] + dt_s * v[0] + k * a0, p[1] + dt_s * v[1] + k * a1, p[2] + dt_s * v[2] + k * a2)
+    velocity = (v[0] + dt_s * a0, v[1] + dt_s * a1, v[2] + dt_s * a2)
+    return State(position, velocity, (e, f, g, h), w), thrust_setpoint + gap * lags[6]

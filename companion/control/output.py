@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from companion.control.law import Command, torque
+from companion.control.law import torque
 from companion.control.types import Quat, Vec3
 from companion.control.vectors import clip, quat_exp, quat_multiply, quat_normalise
 
@@ -68,40 +68,40 @@ def thrust_fraction(thrust_n: float, full_n: float, curve_factor: float) -> floa
     return math.sqrt(half * half + share / curve_factor) - half
 
 
-def rates_output(command: Command, conversion: Conversion) -> RateSetpoint:
+def rates_output(thrust_n: float, rates: Vec3, conversion: Conversion) -> RateSetpoint:
     """Body rates and thrust as they are."""
-    return RateSetpoint(
-        thrust_fraction(command.thrust, conversion.thrust_full_n, conversion.curve_factor), command.rates
-    )
+    return RateSetpoint(thrust_fraction(thrust_n, conversion.thrust_full_n, conversion.curve_factor), rates)
 
 
-def attitude_output(command: Command, q: Quat, w: Vec3, conversion: Conversion) -> AttitudeSetpoint:
+def attitude_output(
+    thrust_n: float, rates: Vec3, tau: Vec3, q: Quat, w: Vec3, conversion: Conversion
+) -> AttitudeSetpoint:
     """R_cmd = R Exp(w_cmd / P_att): the attitude loop then asks its rate loop for w_cmd.
 
     The yaw rate goes along as feed-forward about the world's z axis (px4.md 1.1), so the attitude carries no yaw error.
     An autopilot that filters the setpoint with lag T gets it ahead by T times its own rate of change, w + tau / P_att.
 
     Args:
-        command: what the law wants.
+        thrust_n: thrust setpoint [N].
+        rates: body rate setpoint [rad/s].
+        tau: angular acceleration [rad/s^2].
         q: the attitude predicted for the time of effect.
         w: the body rates there [rad/s].
         conversion: the vehicle's normalisation.
     """
-    gain, lag, rates, tau = conversion.attitude_gain, conversion.attitude_lag, command.rates, command.tau
+    gain, lag = conversion.attitude_gain, conversion.attitude_lag
     lead = (
         (rates[0] + lag * tau[0]) / gain[0] + lag * w[0],
         (rates[1] + lag * tau[1]) / gain[1] + lag * w[1],
         lag * w[2],
     )
-    thrust = thrust_fraction(command.thrust, conversion.thrust_full_n, conversion.curve_factor)
-    return AttitudeSetpoint(thrust, quat_normalise(quat_multiply(q, quat_exp(lead))), command.rates[2])
+    thrust = thrust_fraction(thrust_n, conversion.thrust_full_n, conversion.curve_factor)
+    return AttitudeSetpoint(thrust, quat_normalise(quat_multiply(q, quat_exp(lead))), rates[2])
 
 
-def actuator_output(command: Command, w: Vec3, conversion: Conversion) -> ActuatorSetpoint:
+def actuator_output(thrust_n: float, tau: Vec3, w: Vec3, conversion: Conversion) -> ActuatorSetpoint:
     """n = J tau + S(w) J w (6) over the torque of full control, and the thrust: what actuator controls are."""
-    n = torque(command.tau, w, conversion.inertia)
+    n = torque(tau, w, conversion.inertia)
     full = conversion.torque_full_n_m
     controls = (clip(n[0] / full[0], -1.0, 1.0), clip(n[1] / full[1], -1.0, 1.0), clip(n[2] / full[2], -1.0, 1.0))
-    return ActuatorSetpoint(
-        thrust_fraction(command.thrust, conversion.thrust_full_n, conversion.curve_factor), controls
-    )
+    return ActuatorSetpoint(thrust_fraction(thrust_n, conversion.thrust_full_n, conversion.curve_factor), controls)

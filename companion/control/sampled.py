@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from companion.control import heading
 from companion.control.heading import HeadingState
 from companion.control.law import ControllerState, Parameters, step
-from companion.control.model import advance
+from companion.control.model import advance, factors
 from companion.control.types import Quat, Reference, State
 from companion.control.vectors import quat_exp
 
@@ -97,6 +97,8 @@ class _Loop:
         if duration_s <= 0.0:
             return np.eye(PLANT), np.zeros((PLANT, INPUTS)), np.zeros((PLANT, 3))
         pieces = max(1, math.ceil(duration_s / 0.005))
+        piece_s = duration_s / pieces
+        lags = factors(self.lags, piece_s)
 
         def run(z: FloatArray) -> FloatArray:
             state, thrust = _state(z), float(z[12])
@@ -109,8 +111,8 @@ class _Loop:
                     n[13],
                     (n[17], n[18], n[19]),
                     self.vehicle,
-                    self.lags,
-                    duration_s / pieces,
+                    lags,
+                    piece_s,
                 )
             return np.array([*state.p, *state.v, *_rotation(state.q), *state.w, thrust])
 

@@ -14,10 +14,12 @@ from typing import Any
 import tomlkit
 
 from companion.config import Flight
-from companion.errors import InputError, LinkError
+from companion.errors import ExitCode, InputError, LinkError
 
 TRUTH_FILE = "truth.csv"
 VEHICLE_FILE = "vehicle.toml"
+PX4_VERSIONS = ("1.13", "1.18")
+"""Which PX4 the vehicle can behave like."""
 
 
 def free_udp_port() -> int:
@@ -39,7 +41,7 @@ class BundledVehicle:
 
     Raises:
         InputError: the flight has no [start].
-        LinkError: the vehicle does not start.
+        InputError, LinkError: on entering, when the vehicle does not start; it has said why on stderr.
     """
 
     def __init__(self, flight: Flight, folder: Path, *, px4: str, engine: str, lockstep: bool) -> None:
@@ -66,12 +68,18 @@ class BundledVehicle:
             self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
         assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        with contextlib.suppress(ValueError):
-            if json.loads(line).get("ready"):
-                return self
+        try:
+            line = self._process.stdout.readline()
+            with contextlib.suppress(ValueError):
+                if json.loads(line).get("ready"):
+                    return self
+            code = self._process.wait(10.0)
+        except BaseException:
+            self.stop()
+            raise
         self.stop()
-        raise LinkError("the bundled vehicle did not start; see the line above")
+        kind = InputError if code == ExitCode.BAD_INPUT else LinkError
+        raise kind("the bundled vehicle did not start; see the line above")
 
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None

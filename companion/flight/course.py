@@ -75,4 +75,7 @@ class Course:
 
     def at(self, t_s: float) -> Reference:
         """The reference, `t_s` after engaging; before 0 the start, after the end the point of rest."""
+        on_track_s = t_s - self.join_s
+        if 0.0 <= on_track_s <= self.track_s:  # the usual case, without the search for the piece
+            return self.path.at(on_track_s)
         return self._chain.at(t_s)

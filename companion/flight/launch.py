@@ -60,10 +60,14 @@ def control(folder: Path, connection: str, engine: str, timeout_s: float, listen
         connection: the vehicle link.
         engine: "auto", "python" or "numba".
         timeout_s: how long to wait for a vehicle.
-        listen: gets every status message: {"line"}, {"progress"}, {"ready"}, {"error"} or {"outcome"}.
+        listen: gets every status message: {"line"}, {"progress"}, {"ready"}, {"flown"}, {"error"} or {"outcome"}. One
+            that raises is not called again: a broken display does not end a flight.
+
+    Raises:
+        CompanionError: the control process could not begin.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with ours:
+    with ours, _Relay() as relay:
         with theirs:
             process = subprocess.Popen(
                 [
@@ -75,37 +79,67 @@ def control(folder: Path, connection: str, engine: str, timeout_s: float, listen
                 stdout=sys.stderr,
                 start_new_session=True,  # Ctrl-C in the terminal reaches the flight once, through here
             )
-        with _passing_on_signals(process):
-            last = _follow(ours, listen)
-            code = process.wait()
+        relay.to(process.pid)
+        last = _follow(ours, listen)
+        code = process.wait()
+        relay.to(None)
     if "error" in last:
         raise _failure(str(last["error"]), code)
+    if code < 0 and relay.came and "ready" not in last:
+        return Flown(folder, ExitCode.INTERRUPTED, "interrupted by the operator: before anything connected")
     if code < 0:
-        return Flown(folder, ExitCode.INTERNAL, f"the control process was ended by signal {-code}")
+        return Flown(
+            folder,
+            ExitCode.INTERNAL,
+            f"the control process was ended by signal {-code}; the autopilot's own failsafe acts (COM_OBL_RC_ACT)",
+        )
     return Flown(folder, code, str(last.get("outcome", "the control process ended without a word; see above")))
 
 
-@contextlib.contextmanager
-def _passing_on_signals(process: subprocess.Popen[bytes]) -> Any:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+class _Relay:
+    """While it lasts, signals that end a command go to the control process instead; a context manager.
 
-    def pass_on(number: int, _: object) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process.pid, signal.SIGINT if number == signal.SIGINT else signal.SIGTERM)
+    They arrive there as SIGTERM: a process that is still starting ends at it without a word, one that flies hands over.
+    Other threads than the main one cannot have signals: there it does nothing.
+    """
 
-    before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
+    _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+    def __init__(self) -> None:
+        self.came = False
+        """Whether a signal came."""
+        self._pid: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Relay:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._pass_on) for number in self._NUMBERS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def to(self, pid: int | None) -> None:
+        """Names the process; one that came before is passed on now."""
+        self._pid = pid
+        if self.came:
+            self._send()
+
+    def _pass_on(self, number: int, frame: object) -> None:
+        self.came = True
+        self._send()
+
+    def _send(self) -> None:
+        if self._pid is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGTERM)
 
 
 def _follow(channel: socket.socket, listen: Listener) -> dict[str, Any]:
     """Reads status until the control process closes its end; returns the messages merged, the latest of each kind."""
     merged: dict[str, Any] = {}
+    shown = True
     with selectors.DefaultSelector() as selector:
         selector.register(channel, selectors.EVENT_READ)
         while True:
@@ -115,7 +149,13 @@ def _follow(channel: socket.socket, listen: Listener) -> dict[str, Any]:
                 return merged
             message = json.loads(data)
             merged.update(message)
-            listen(message)
+            try:
+                if shown:
+                    listen(message)
+            except Exception as error:
+                shown = False
+                with contextlib.suppress(OSError):
+                    print(f"companion: the display failed ({error}); the flight goes on", file=sys.stderr)
 
 
 def _failure(text: str, code: int) -> CompanionError:

@@ -3,30 +3,36 @@
 A turn waits for the link, drains it, answers the newest state with a setpoint, and answers TIMESYNC requests after
 that. A vehicle in lockstep (its clock waits for those answers, DESIGN "Lockstep") gets exactly one turn per state, so
 the same seed gives the same flight. Nothing is sent that is not computed from a fresh state, except the one coast
-setpoint when states cease.
+setpoint when states cease. However the loop ends, a vehicle that may be following its setpoints is handed over to Hold.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import math
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from companion.config import Flight
 from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, RateSetpoint, Setpoint, thrust_fraction
-from companion.control.types import GRAVITY_M_S2, State
+from companion.control.types import GRAVITY_M_S2, State, Vec3
 from companion.control.vectors import axes
 from companion.errors import LinkError
 from companion.flight.clock import VehicleClock
+from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
 from companion.flight.course import at_rest
-from companion.flight.phases import PHASE_INDEX, PHASE_NAMES, Autopilot, Cause, FlightEnded, LandedState, Outcome, Phase
+from companion.flight.last_resort import ask_for_hold
+from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Outcome, Phase
 from companion.flight.preflight import CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION
+from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
-from companion.flight.tracker import Kernels, Tracker, TrackerStep
+from companion.flight.tracker import Kernels, Tracker
 from companion.frames import tilt_from_quat, yaw_from_quat
 from companion.link import codec, timesync
+from companion.link.codec import Timesync
 from companion.link.framing import Frame
 from companion.link.modes import Mode
 from companion.link.operations import Operations
@@ -41,13 +47,21 @@ SILENCE_MIN_S = 0.05
 """A state may be late by three of its periods, and by this at least: at 250 Hz three periods are 12 ms, which a busy
 machine takes for itself now and then; the prediction bridges that, and PX4 holds the last rates no longer than this."""
 SILENT_PERIODS = 3.0
-PACED_SILENCE_S = 5.0
+PACED_SILENCE_S = 3.0
 """Wall time after which a vehicle in lockstep, whose clock stands still while it is silent, counts as lost."""
+LINK_SILENCE_S = 5.0
+"""The same for any other vehicle, while no states are due: five of its heartbeats."""
+OFFBOARD_LOSS_S = 1.0
+"""COM_OF_LOSS_T where it could not be read."""
+PACE_STATES = 15
+PACE_WALL_S = 3.0
+"""A vehicle in lockstep shows itself within so many states; without any, so long is waited for them."""
 HEARTBEAT_INTERVAL_S = 1.0
 LATE_SHARE = 0.2
 TILT_FOR_S = 0.2
-AUTOPILOT_COMPONENT = 1
 IDLE_WAIT_S = 0.1
+BUSY_WAIT_S = 0.01
+PROGRESS_NS = 100_000_000
 
 
 class Progress(NamedTuple):
@@ -73,6 +87,7 @@ class FlightLoop:
         notify: called with a line for people at every change; must not block.
         progress: called at most ten times per second of wall time; must not block.
         connect_timeout_s: how long to wait for the first heartbeat (wall time).
+        connection: what to call the link in explanations.
     """
 
     def __init__(
@@ -85,6 +100,7 @@ class FlightLoop:
         notify: Callable[[str], None] = lambda line: None,
         progress: Callable[[Progress], None] = lambda progress: None,
         connect_timeout_s: float = 15.0,
+        connection: str = "this link",
     ) -> None:
         self._flight = flight
         self._trajectory = trajectory
@@ -93,6 +109,7 @@ class FlightLoop:
         self._notify = notify
         self._progress = progress
         self._connect_timeout_s = connect_timeout_s
+        self._connection = connection
         self._tracker = Tracker(flight.vehicle, flight.output.kind, compiled)
         self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
         self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
@@ -101,11 +118,6 @@ class FlightLoop:
         self._clock = VehicleClock(self._peer)
         self._autopilot = Autopilot()
         self._interrupted = False
-        # known once an autopilot was heard
-        self._telemetry: Telemetry | None = None
-        self._ops: Operations | None = None
-        self._sender: SetpointSender | None = None
-        self._sequence: Sequence | None = None
         # the newest state that was not answered yet, with its arrival
         self._pending: VehicleState | None = None
         self._pending_wall_ns = 0
@@ -113,11 +125,16 @@ class FlightLoop:
         self._lost = 0
         self._last_state: VehicleState | None = None
         self._last_state_s = 0.0
+        self._sent_us: int | None = None
+        """Stamp of the last state that a setpoint went out for."""
         self._coasted = False
         self._tilted_since_s: float | None = None
         self._heartbeat_s = -math.inf
         self._progress_ns = 0
+        self._requests: list[tuple[Timesync, Frame]] = []
         self._timesync_at_ns: int | None = None
+        self._begun_ns = self._heard_ns = self._spoken_ns = time.monotonic_ns()
+        self._known_ns: int | None = None
 
     # -- from outside ---------------------------------------------------------------------------------------------
 
@@ -126,63 +143,59 @@ class FlightLoop:
         self._interrupted = True
 
     def run(self) -> Outcome:
-        """Flies. Returns how it ended; never raises for anything that the vehicle or the link does."""
-        cause, detail = Cause.LINK_LOST, ""
+        """Flies. Returns how it ended; never raises for anything that the vehicle, the link or the law does."""
+        fault = ""
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # a collection would stop the loop for 14 to 92 ms
         try:
-            self._connect()
+            cause, detail = self._fly()
+        except KeyboardInterrupt:
+            cause, detail = Cause.INTERRUPTED, ""
+        except Exception as error:
+            cause, detail, fault = Cause.FAULT, f"{type(error).__name__}: {error}", traceback.format_exc()
+        try:
+            detail = self._leave(detail)
+        finally:
+            gc.enable()
+            gc.unfreeze()
+        if not hasattr(self, "_sequence"):
+            return Outcome(cause, detail, [], 0, {}, fault)
+        rejected = {reason.name: n for reason, n in self._telemetry.rejected.items() if n}
+        return Outcome(cause, detail, self._sequence.changes, self._lost, rejected, fault)
+
+    def _fly(self) -> tuple[Cause, str]:
+        try:
+            self._meet()
             while True:
                 self._turn()
         except FlightEnded as ended:
-            cause, detail = ended.cause, ended.detail
+            return ended.cause, ended.detail
         except LinkError as error:
-            cause, detail = Cause.LINK_LOST, str(error)
-        finally:
-            gc.enable()
-        sequence = self._sequence
-        rejected = {} if self._telemetry is None else {r.name: n for r, n in self._telemetry.rejected.items() if n}
-        return Outcome(cause, detail, [] if sequence is None else sequence.changes, self._lost, rejected)
+            return Cause.LINK_LOST, str(error)
+
+    def _leave(self, detail: str) -> str:
+        """However it ended: a vehicle that may still be following setpoints gets the coast setpoint and Hold."""
+        if not hasattr(self, "_sequence") or not self._sequence.owes_hold:
+            return detail
+        with contextlib.suppress(Exception):  # what failed may fail again; Hold is asked for all the same
+            self._coast()
+        self._sequence.duty = Duty.NOTHING
+        taken = ask_for_hold(self._wire, self._ops.target_system)
+        how = "handed over to Hold" if taken else "Hold was not acknowledged, the autopilot's own failsafe acts"
+        return f"{detail}; {how}".lstrip("; ")
 
     # -- connecting -----------------------------------------------------------------------------------------------
 
-    def _connect(self) -> None:
-        """Waits for an autopilot's heartbeat and its time; answers with a heartbeat of its own.
+    def _meet(self) -> None:
+        """Waits for the autopilot's heartbeat.
 
         Raises:
             FlightEnded: none came.
         """
-        deadline_ns = time.monotonic_ns() + int(self._connect_timeout_s * 1e9)
-        heard_ns: int | None = None
-        while True:
-            wall_ns = time.monotonic_ns()
-            if self._interrupted:
-                raise FlightEnded(Cause.INTERRUPTED, "before a vehicle was found")
-            if wall_ns > deadline_ns:
-                raise FlightEnded(Cause.NO_VEHICLE, self._explain_silence(heard_ns is not None))
-            for frame in self._wire.receive(IDLE_WAIT_S):
-                if self._ops is None and frame.msgid == codec.HEARTBEAT:
-                    self._meet(frame)
-                if self._ops is not None:
-                    self._on_frame(frame)
-            if self._ops is not None and (heard_ns is None or wall_ns - heard_ns > 1_000_000_000):
-                heard_ns = wall_ns
-                self._send_heartbeat()
-            if self._ops is not None and self._clock.known:
-                now_s = self._clock.now_s(time.monotonic_ns())
-                self._heartbeat_s = now_s
-                self._last_state_s = now_s
-                assert self._sequence is not None
-                peer = f"system {self._ops.target_system}"
-                self._sequence.enter(Phase.CONNECT, now_s, f"heard the autopilot ({peer})")
-                self._sequence.enter(Phase.PREFLIGHT, now_s, "asking for rates, version and parameters")
-                self._sequence.tick(now_s)
-                return
-
-    def _meet(self, frame: Frame) -> None:
-        heartbeat = codec.decode_heartbeat(frame.payload)
-        if frame.compid != AUTOPILOT_COMPONENT or heartbeat.autopilot == codec.MAV_AUTOPILOT_INVALID:
-            return
-        system = frame.sysid
-        self._wire.system_id = system
+        self._begun_ns = time.monotonic_ns()
+        system = find_autopilot(self._wire, self._connection, self._connect_timeout_s, lambda: self._interrupted)
+        self._heard_ns = self._spoken_ns = time.monotonic_ns()
         self._telemetry = Telemetry(system)
         self._ops = Operations(self._wire.send, system)
         self._sender = SetpointSender(self._wire.send, system)
@@ -190,20 +203,23 @@ class FlightLoop:
             self._flight, self._trajectory, self._ops, self._autopilot, self._engage, self._notify
         )
 
-    def _explain_silence(self, heard: bool) -> str:
-        waited = f"within {self._connect_timeout_s:g} s"
-        if heard:
-            return (
-                f"an autopilot's heartbeat came but neither TIMESYNC nor ODOMETRY {waited}: is this its onboard link?"
-            )
-        c = self._wire.counters
-        seen = "nothing came"
-        if c.received:
-            seen = f"{c.received} MAVLink frames came, none of them an autopilot's heartbeat,"
-        return (
-            f"{seen} {waited}: check that the vehicle sends to this port (PX4 SITL: 14540; the bundled one: `sim-link"
-            " run`) and that no other program holds the vehicle's link"
-        )
+    def _begin(self) -> bool:
+        """Begins the flight once the vehicle's time is known, and whether it waits for us."""
+        if not self._clock.known:
+            return False
+        wall_ns = time.monotonic_ns()
+        if self._known_ns is None:
+            self._known_ns = wall_ns
+        undecided = self._telemetry.accepted < PACE_STATES and wall_ns - self._known_ns < PACE_WALL_S * 1e9
+        if undecided and not self._peer.paced:
+            return False
+        now_s = self._clock.now_s(wall_ns)
+        self._heartbeat_s = self._last_state_s = now_s
+        in_lockstep = ", in lockstep" if self._peer.paced else ""
+        peer = f"system {self._ops.target_system}{in_lockstep}"
+        self._sequence.enter(Phase.CONNECT, now_s, f"heard the autopilot ({peer})")
+        self._sequence.enter(Phase.PREFLIGHT, now_s, "asking for rates, version and parameters")
+        return True
 
     # -- one turn -------------------------------------------------------------------------------------------------
 
@@ -213,25 +229,36 @@ class FlightLoop:
         if not self._peer.paced:
             self._answer_state()
             self._tick()
-        elif self._clock.silent_wall_s(time.monotonic_ns()) > PACED_SILENCE_S:
-            self._coast()
-            raise FlightEnded(Cause.LINK_LOST, f"no message for {PACED_SILENCE_S:g} s")
-        if self._interrupted and self._sequence is not None and self._sequence.ending is None:
-            self._sequence.end(Cause.INTERRUPTED, "", self._clock.now_s(time.monotonic_ns()))
+        self._answer_requests()
+        self._look_at_the_wall_clock()
 
     def _wait_s(self) -> float:
-        assert self._sequence is not None
-        if self._peer.paced:
-            return IDLE_WAIT_S
-        if self._sequence.duty is Duty.NOTHING and self._sequence.ending is None:
-            return IDLE_WAIT_S
-        return 0.01
+        idle = self._peer.paced or (self._sequence.duty is Duty.NOTHING and self._sequence.ending is None)
+        return IDLE_WAIT_S if idle else BUSY_WAIT_S
+
+    def _look_at_the_wall_clock(self) -> None:
+        """What does not wait for the vehicle's time: the operator's wish, and a vehicle that says nothing more."""
+        wall_ns = time.monotonic_ns()
+        if not self._sequence.changes:
+            if self._interrupted:
+                raise FlightEnded(Cause.INTERRUPTED, "before anything was asked of the vehicle")
+            if wall_ns - self._begun_ns > self._connect_timeout_s * 1e9:
+                raise FlightEnded(Cause.NO_VEHICLE, explain_no_time(self._connection, self._connect_timeout_s))
+            if wall_ns - self._spoken_ns > HEARTBEAT_INTERVAL_S * 1e9:
+                self._spoken_ns = wall_ns
+                send_heartbeat(self._wire)
+            return
+        if self._interrupted:
+            self._sequence.interrupt(self._clock.now_s(wall_ns))
+        limit_s = PACED_SILENCE_S if self._peer.paced else LINK_SILENCE_S
+        if wall_ns - self._heard_ns > limit_s * 1e9:
+            raise FlightEnded(Cause.LINK_LOST, f"no message for {limit_s:g} s")
 
     def _on_frame(self, frame: Frame) -> None:
-        assert self._ops is not None
         msgid = frame.msgid
         if frame.sysid != self._ops.target_system or frame.compid != AUTOPILOT_COMPONENT:
             return
+        self._heard_ns = frame.arrival_wall_ns
         if msgid == codec.ODOMETRY:
             self._on_odometry(frame)
         elif msgid == codec.TIMESYNC:
@@ -251,6 +278,7 @@ class FlightLoop:
             return
         if frame.msgid == CURRENT_MODE:
             self._autopilot.mode = Mode.from_custom_mode(message.custom_mode)
+            self._autopilot.intended = Mode.from_custom_mode(message.intended_custom_mode)
         elif frame.msgid == EXTENDED_SYS_STATE:
             value = message.landed_state
             known = {state.value for state in LandedState}
@@ -260,7 +288,6 @@ class FlightLoop:
             self._autopilot.home_amsl_m = message.altitude * 1e-3
 
     def _on_odometry(self, frame: Frame) -> None:
-        assert self._telemetry is not None
         state = self._telemetry.on_odometry(frame)
         if isinstance(state, StateRejection):
             if state is StateRejection.REBOOTED:
@@ -277,68 +304,82 @@ class FlightLoop:
 
     def _on_timesync(self, frame: Frame) -> None:
         """A request is answered after the setpoint for the state that came before it."""
-        assert self._ops is not None
         message = codec.decode_timesync(frame.payload)
-        wire = self._wire
-        if not timesync.is_request(message, wire.system_id, wire.component_id):
+        if not timesync.is_request(message, self._wire.system_id, self._wire.component_id):
             return
         self._peer.on_request()
         self._clock.on_timesync(message.ts1, frame.arrival_wall_ns)
+        self._requests.append((message, frame))
         if self._peer.paced:
             self._timesync_at_ns = message.ts1
             self._answer_state()
             self._tick()
-        wall_ns = time.monotonic_ns()
-        wire.send(codec.TIMESYNC, timesync.answer(message, wall_ns, frame.sysid, frame.compid))
+            self._answer_requests()
+
+    def _answer_requests(self) -> None:
+        wire = self._wire
+        for message, frame in self._requests:
+            answer = timesync.answer(message, time.monotonic_ns(), frame.sysid, frame.compid)
+            wire.send(codec.TIMESYNC, answer)
+        self._requests.clear()
 
     def _tick(self) -> None:
         """What time alone brings: heartbeat, requests, phases, silence."""
         sequence = self._sequence
-        if sequence is None or not sequence.changes:
+        if not sequence.changes and not self._begin():
             return
         now_s = self._clock.now_s(time.monotonic_ns())
         if now_s - self._heartbeat_s >= HEARTBEAT_INTERVAL_S:
             self._heartbeat_s = now_s
-            self._send_heartbeat()
+            send_heartbeat(self._wire)
         if sequence.duty is not Duty.NOTHING and now_s - self._last_state_s > self._silence_s:
-            self._coast()
-            sequence.duty = Duty.NOTHING
-            limit_ms = self._silence_s * 1e3
-            sequence.end(Cause.STATE_LOST, f"none for {limit_ms:.0f} ms of vehicle time", now_s)
+            self._stop_answering(Cause.STATE_LOST, f"none for {self._silence_s * 1e3:.0f} ms of vehicle time", now_s)
         sequence.tick(now_s)
 
-    def _send_heartbeat(self) -> None:
-        payload = codec.encode_heartbeat(
-            codec.MAV_TYPE_ONBOARD_CONTROLLER, codec.MAV_AUTOPILOT_INVALID, 0, 0, codec.MAV_STATE_ACTIVE
-        )
-        self._wire.send(codec.HEARTBEAT, payload)
+    def _stop_answering(self, cause: Cause, detail: str, now_s: float) -> None:
+        """The one coast setpoint, then none any more, and Hold."""
+        self._coast()
+        self._sequence.duty = Duty.NOTHING
+        self._sequence.end(cause, detail, now_s)
 
     # -- the control step -----------------------------------------------------------------------------------------
 
     def _answer_state(self) -> None:
         """Answers the newest state, if there is one, with the setpoint that is due."""
         state = self._pending
-        sequence = self._sequence
-        if state is None or sequence is None:
+        if state is None:
             return
         self._pending = None
         skipped, self._skipped = self._skipped, 0
-        arrival_ns = self._pending_wall_ns
+        sequence, arrival_ns = self._sequence, self._pending_wall_ns
         now_s = self._clock.now_s(arrival_ns)
         before, self._last_state = self._last_state, state
         self._last_state_s = now_s
         sequence.on_state(state, now_s)
         if sequence.duty is Duty.NOTHING:
             return
-        if before is not None and before.reset_counter != state.reset_counter and sequence.ending is None:
+        if before is not None and before.reset_counter != state.reset_counter:
             moved = math.dist(before.p, state.p)
-            sequence.end(Cause.ESTIMATE_JUMPED, f"reset counter {state.reset_counter}, moved by {moved:.2f} m", now_s)
-            return
-        if sequence.duty is Duty.STREAM:
+            detail = f"reset counter {state.reset_counter}, moved by {moved:.2f} m"
+            self._stop_answering(Cause.ESTIMATE_JUMPED, detail, now_s)
+        elif self._silent_too_long(state):
+            assert self._sent_us is not None
+            sequence.duty = Duty.NOTHING
+            detail = f"none for {(state.t_vehicle_us - self._sent_us) * 1e-6:.2f} s of vehicle time"
+            sequence.end(Cause.OWN_SILENCE, detail, now_s)
+        elif sequence.duty is Duty.STREAM:
             self._stream(state)
         else:
             self._lost += skipped
             self._track(state, skipped, arrival_ns)
+
+    def _silent_too_long(self, state: VehicleState) -> bool:
+        """After more than half of COM_OF_LOSS_T PX4 may be about to leave OFFBOARD, and would come back at the next
+        setpoint."""
+        if self._sent_us is None:
+            return False
+        loss_s = self._autopilot.parameters.get("COM_OF_LOSS_T", OFFBOARD_LOSS_S)
+        return state.t_vehicle_us - self._sent_us > 0.5e6 * loss_s
 
     def _stream(self, state: VehicleState) -> None:
         """A hold setpoint for where the vehicle is; nothing integrates while the autopilot does not follow."""
@@ -348,15 +389,12 @@ class FlightLoop:
         self._send(self._tracker.step(state.t_vehicle_us * 1e-6, now, lambda t: hold).setpoint, state)
 
     def _engage(self, state: VehicleState) -> None:
-        """OFFBOARD is confirmed: the controller starts from the hover, the collector stops collecting."""
+        """OFFBOARD is confirmed: the controller starts from the hover."""
         self._tracker.begin(State(state.p, state.v, state.q, state.w))
-        gc.collect()
-        gc.freeze()
-        gc.disable()
 
     def _track(self, state: VehicleState, skipped: int, arrival_ns: int) -> None:
         sequence = self._sequence
-        assert sequence is not None and sequence.course is not None
+        assert sequence.course is not None
         course, begin_s = sequence.course, sequence.engaged_at_s
         stamp_s = state.t_vehicle_us * 1e-6
         out = self._tracker.step(stamp_s, State(state.p, state.v, state.q, state.w), lambda t: course.at(t - begin_s))
@@ -366,31 +404,41 @@ class FlightLoop:
         sent_ns = time.monotonic_ns()
         reference = course.at(stamp_s - begin_s)
         error = (state.p[0] - reference.p[0], state.p[1] - reference.p[1], state.p[2] - reference.p[2])
-        self._write(state, reference, error, out, skipped, arrival_ns, sent_ns)
-        self._guard(state, error, stamp_s)
-        if sent_ns - self._progress_ns > 100_000_000:
+        phase, track_s = sequence.phase, sequence.track_time_s(stamp_s)
+        shown_s = track_s if phase is Phase.TRACK else math.nan
+        timing = self._timing(state, skipped, arrival_ns, sent_ns)
+        row = control_row(shown_s, phase, state, reference, error, out, timing)
+        self._record.append(row)
+        self._guard(state, error, self._clock.now_s(arrival_ns))
+        if sent_ns - self._progress_ns > PROGRESS_NS:
             self._progress_ns = sent_ns
-            t = sequence.track_time_s(stamp_s)
-            self._progress(Progress(sequence.phase.value, t, course.track_s, math.hypot(*error), len(self._record)))
+            self._progress(Progress(phase.value, track_s, course.track_s, math.hypot(*error), len(self._record)))
+
+    def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:
+        took_ns = sent_ns - arrival_ns
+        if self._timesync_at_ns is not None:
+            age_ms = (self._timesync_at_ns - state.t_vehicle_us * 1000 + took_ns) * 1e-6
+        else:
+            age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
+        return StepTiming(age_ms, took_ns * 1e-3, took_ns > self._late_ns, skipped)
 
     def _send(self, setpoint: Setpoint, state: VehicleState) -> bool:
-        assert self._sender is not None and self._sequence is not None
         try:
-            return self._sender.send(setpoint, state.t_vehicle_us)
+            sent = self._sender.send(setpoint, state.t_vehicle_us)
         except UnsendableSetpoint as error:
-            self._sequence.end(Cause.UNSENDABLE, str(error), self._clock.now_s(time.monotonic_ns()))
-            self._sequence.duty = Duty.NOTHING
+            self._stop_answering(Cause.UNSENDABLE, str(error), self._clock.now_s(time.monotonic_ns()))
             return False
+        if sent:
+            self._sent_us = state.t_vehicle_us
+        return sent
 
-    def _guard(self, state: VehicleState, error: tuple[float, float, float], now_s: float) -> None:
+    def _guard(self, state: VehicleState, error: Vec3, now_s: float) -> None:
         """The bounds that a flight is ended by."""
         limits = self._flight.vehicle.limits
-        sequence = self._sequence
-        assert sequence is not None
         size = math.hypot(*error)
         if size > limits.position_error_abort_m:
             detail = f"{size:.2f} m, limit {limits.position_error_abort_m:g} m (limits.position_error_abort_m)"
-            sequence.end(Cause.POSITION_ERROR, detail, now_s)
+            self._sequence.end(Cause.POSITION_ERROR, detail, now_s)
         tilt = tilt_from_quat(state.q)
         if tilt <= limits.tilt_max_rad:
             self._tilted_since_s = None
@@ -398,12 +446,12 @@ class FlightLoop:
             self._tilted_since_s = now_s
         elif now_s - self._tilted_since_s > TILT_FOR_S:
             detail = f"{tilt:.2f} rad for {TILT_FOR_S:g} s, limit {limits.tilt_max_rad:g} rad (limits.tilt_max_rad)"
-            sequence.end(Cause.TILT, detail, now_s)
+            self._sequence.end(Cause.TILT, detail, now_s)
 
     def _coast(self) -> None:
         """The one setpoint without a fresh state: no rotation, hover thrust over the cosine of the tilt."""
-        sequence, state = self._sequence, self._last_state
-        if self._coasted or state is None or sequence is None or sequence.duty is Duty.NOTHING:
+        state = self._last_state
+        if self._coasted or state is None or self._sequence.duty is Duty.NOTHING:
             return
         self._coasted = True
         vehicle, limits = self._flight.vehicle, self._flight.vehicle.limits
@@ -418,34 +466,5 @@ class FlightLoop:
             setpoint = ActuatorSetpoint(thrust, (0.0, 0.0, 0.0))
         self._send(setpoint, state)
 
-    def _write(
-        self,
-        state: VehicleState,
-        reference: Any,
-        error: tuple[float, float, float],
-        out: TrackerStep,
-        skipped: int,
-        arrival_ns: int,
-        sent_ns: int,
-    ) -> None:
-        """One row of the record (record/columns.py has the order)."""
-        sequence = self._sequence
-        assert sequence is not None
-        stamp_s = state.t_vehicle_us * 1e-6
-        track_s = sequence.track_time_s(stamp_s) if sequence.phase is Phase.TRACK else math.nan
-        if self._timesync_at_ns is not None:
-            age_ms = (self._timesync_at_ns - state.t_vehicle_us * 1000) * 1e-6 + (sent_ns - arrival_ns) * 1e-6
-        else:
-            age_ms = (self._clock.now_s(sent_ns) - stamp_s) * 1e3
-        e, c = out.errors, self._tracker.controller
-        took_ns = sent_ns - arrival_ns
-        self._record.append(
-            (stamp_s, track_s, PHASE_INDEX[sequence.phase], *state.p, *state.v, *state.q, *state.w)
-            + (*reference.p, *reference.v, *error, out.heading_error, *e.e1, *e.e2, *e.e3, *e.e4)
-            + (self._tracker.lyapunov(e), *c.b_hat, c.thrust, c.thrust_rate, *out.command.tau, *out.command.rates)
-            + (out.setpoint.thrust, age_ms, took_ns * 1e-3, float(took_ns > self._late_ns), float(skipped))
-            + (float(out.command.limits),)
-        )
 
-
-__all__ = ["PHASE_NAMES", "FlightLoop", "Progress"]
+__all__ = ["FlightLoop", "Progress"]

@@ -45,11 +45,13 @@ class Cause(Enum):
     STATE_LOST = Ending("no usable state came from the vehicle any more", ExitCode.LOST)
     LINK_LOST = Ending("the vehicle went silent", ExitCode.LOST)
     REBOOTED = Ending("the autopilot restarted", ExitCode.LOST)
-    TAKEN_OVER = Ending("the vehicle left OFFBOARD by another hand", ExitCode.LOST)
+    OWN_SILENCE = Ending("no setpoint went out for too long", ExitCode.LOST)
+    TAKEN_OVER = Ending("another hand took the vehicle over", ExitCode.LOST)
     ESTIMATE_JUMPED = Ending("the autopilot's position estimate was reset", ExitCode.LOST)
     POSITION_ERROR = Ending("the position error left its limit", ExitCode.LOST)
     TILT = Ending("the tilt left its limit", ExitCode.LOST)
     UNSENDABLE = Ending("the law gave a setpoint that must not be sent", ExitCode.INTERNAL)
+    FAULT = Ending("a fault of the program", ExitCode.INTERNAL)
 
 
 class FlightEnded(Exception):  # noqa: N818 - it names what happened, not a fault
@@ -76,6 +78,9 @@ class Autopilot:
     """What the autopilot has said of itself; None until it did."""
 
     mode: Mode | None = None
+    """What it flies, a failsafe's mode included."""
+    intended: Mode | None = None
+    """What was asked of it; PX4 goes back there when a failsafe's reason is gone. None before it told."""
     armed: bool = False
     landed: LandedState = LandedState.UNDEFINED
     home: Vec3 | None = None
@@ -94,6 +99,8 @@ class Outcome:
     phases: list[PhaseChange]
     lost_setpoints: int
     rejected_states: dict[str, int]
+    fault: str = ""
+    """The traceback, when the program itself failed."""
 
     @property
     def sentence(self) -> str:

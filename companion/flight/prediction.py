@@ -1,23 +1,29 @@
-"""The state at the time a command takes effect, predicted with the commands already sent (paper.md section 8, "Delay").
+"""The commands between a state's stamp and the time at which the next command takes effect (paper.md section 8,
+"Delay").
 
 A command computed from a state stamped s acts from s + delay until the next one does. So between a stamp and its time
-of effect the commands of the last delay/interval samples act one after the other; `Prediction` remembers them with
-their times and runs the law's own model (`control.model.advance`) through them. The thrust that acts at the stamp is
-not measured: it is followed with the same model.
+of effect the commands of the last delay/interval samples act one after the other. `Prediction` remembers them with
+their times and gives them as a few pieces (`control.model.advance` runs through them). The thrust that acts at the
+stamp is not measured: it is followed with the same model.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from companion.control.law import Command, Parameters
-from companion.control.model import advance, lagged
-from companion.control.types import State, Vec3
+from companion.control.model import lagged
+from companion.control.types import Vec3
 
+PIECE_MAX_S = 0.010
+"""Commands are averaged over pieces of at most this length: the rates lag by more, and every piece costs time."""
 SHORTEST_S = 1e-6
-"""Pieces shorter than this are rounding errors of the stamps."""
+"""Shorter pieces are rounding errors of the stamps."""
+
+Piece = tuple[float, Vec3, float]
+"""Mean thrust setpoint [N], mean rate setpoints [rad/s], duration [s]."""
 
 
 class Acting(NamedTuple):
@@ -29,68 +35,68 @@ class Acting(NamedTuple):
 
 
 class Prediction:
-    """Remembers what was sent and predicts states; one per flight.
+    """Remembers what was sent; one per flight.
 
     Args:
-        parameters: the law's model (mass, gravity, drag).
-        lags: time constants of roll, pitch, yaw rate and thrust behind their setpoints [s].
+        thrust_lag_s: time constant of the thrust behind its setpoint [s].
         delay_s: from the stamp of a state to the effect of its command [s].
         thrust_n: the thrust that acts at the start [N].
-        advance_kernel: `control.model.advance` or its compiled twin.
     """
 
-    def __init__(
-        self,
-        parameters: Parameters,
-        lags: tuple[float, float, float, float],
-        delay_s: float,
-        thrust_n: float,
-        advance_kernel: Callable[..., Any] = advance,
-    ) -> None:
-        self._vehicle = (parameters.model.mass, parameters.model.gravity, parameters.model.drag)
-        self._lags = lags
-        self._advance = advance_kernel
+    def __init__(self, thrust_lag_s: float, delay_s: float, thrust_n: float) -> None:
+        self.thrust = thrust_n
+        """The thrust that acts at the last stamp [N], by the model."""
+        self._thrust_lag_s = thrust_lag_s
         self._delay_s = delay_s
-        self._thrust = thrust_n
-        self._thrust_at_s: float | None = None
+        self._at_s: float | None = None
         self._acting: deque[Acting] = deque()
+        self._count = math.ceil(delay_s / PIECE_MAX_S - 1e-9)
+        self.length_s = delay_s / self._count if self._count else 0.0
+        """Length of the pieces [s]; 0 without a delay."""
 
-    def sent(self, stamp_s: float, command: Command) -> None:
-        """Remembers a command computed from the state stamped `stamp_s` (vehicle time)."""
-        self._acting.append(Acting(stamp_s + self._delay_s, command.thrust, command.rates_model))
+    def sent(self, stamp_s: float, thrust_n: float, rates: Sequence[float]) -> None:
+        """Remembers a command (thrust [N], body rates [rad/s]) computed from the state stamped `stamp_s`."""
+        self._acting.append(Acting(stamp_s + self._delay_s, thrust_n, (rates[0], rates[1], rates[2])))
 
-    def predict(self, stamp_s: float, state: State, b_hat: Vec3) -> State:
-        """The state `delay_s` after its stamp; the state itself when there is no delay or nothing was sent yet."""
+    def pieces(self, stamp_s: float) -> list[Piece]:
+        """What acts from a stamp until its own command will; empty without a delay or before the first command."""
         self._follow_thrust(stamp_s)
-        end_s = stamp_s + self._delay_s
-        acting = self._acting
-        if not acting or self._delay_s <= 0.0:
-            return state
-        thrust = self._thrust
-        at = stamp_s
-        for i, command in enumerate(acting):
-            until = acting[i + 1].from_s if i + 1 < len(acting) else end_s
-            duration = min(until, end_s) - at
-            if duration <= SHORTEST_S:
-                continue
-            state, thrust = self._advance(
-                state, thrust, command.rates, command.thrust, b_hat, self._vehicle, self._lags, duration
-            )
-            at += duration
-        return state
+        acting, length = self._acting, self.length_s
+        if not acting or not self._count:
+            return []
+        out: list[Piece] = []
+        at, edge = stamp_s, stamp_s + length
+        thrust = x = y = z = 0.0
+        last = len(acting) - 1
+        for index, (_, t, (p, q, r)) in enumerate(acting):
+            until = acting[index + 1].from_s if index < last else math.inf
+            while until > edge - SHORTEST_S:  # the piece ends within this command
+                share = edge - at
+                k = 1.0 / length
+                mean = (k * (x + share * p), k * (y + share * q), k * (z + share * r))
+                out.append((k * (thrust + share * t), mean, length))
+                if len(out) == self._count:
+                    return out
+                thrust = x = y = z = 0.0
+                at, edge = edge, edge + length
+            share = until - at
+            if share > 0.0:
+                thrust += share * t
+                x, y, z = x + share * p, y + share * q, z + share * r
+                at = until
+        return out
 
     def _follow_thrust(self, stamp_s: float) -> None:
         """Brings the modelled thrust to the stamp and forgets commands that have ceased to act."""
         acting = self._acting
-        last = self._thrust_at_s
-        self._thrust_at_s = stamp_s
+        last, self._at_s = self._at_s, stamp_s
         if last is None or not acting:
             return
         at = max(last, acting[0].from_s)
         while True:
             until = min(stamp_s, acting[1].from_s) if len(acting) > 1 else stamp_s
             if until - at > SHORTEST_S:
-                self._thrust = lagged(self._thrust, acting[0].thrust, self._lags[3], until - at)[0]
+                self.thrust = lagged(self.thrust, acting[0].thrust, self._thrust_lag_s, until - at)[0]
                 at = until
             if len(acting) < 2 or acting[1].from_s > stamp_s + SHORTEST_S:
                 return

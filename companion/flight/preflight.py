@@ -30,6 +30,11 @@ FIRST_STATE_TIMEOUT_S = 5.0
 
 PARAMETERS = ("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE", "THR_MDL_FAC")
 
+_STICK_ACTIONS = (0.0, 1.0, 2.0)
+"""COM_OBL_RC_ACT: Position, Altitude, Stabilized; without sticks NAV_RCL_ACT acts instead."""
+_NO_ACTIONS = (0.0, 7.0)
+"""NAV_RCL_ACT: disabled, and "Hold, no failsafe"."""
+
 CURRENT_MODE = 436
 EXTENDED_SYS_STATE = 245
 HOME_POSITION = 242
@@ -170,6 +175,7 @@ class Preflight:
                 "parameter MAV_TYPE is 0 (generic): PX4 then takes the thrust of SET_ATTITUDE_TARGET as zero; set it to"
                 " the vehicle's type (2 for a quadrotor)",
             )
+        self._gate_failsafe()
         version = self._ops.version
         if self._flight.output.kind == "actuators" and (version is None or not version.accepts_actuator_control):
             label = "an unknown version" if version is None else f"version {version.label}"
@@ -177,6 +183,18 @@ class Preflight:
                 Cause.REFUSED,
                 f"output actuators: the autopilot is {label}, and PX4 ignores SET_ACTUATOR_CONTROL_TARGET since 1.14;"
                 " use output rates",
+            )
+
+    def _gate_failsafe(self) -> None:
+        """Something must happen when the setpoints cease: with these two there is nothing, PX4 holds the last one."""
+        parameters = self._autopilot.parameters
+        on_loss, without_sticks = parameters.get("COM_OBL_RC_ACT"), parameters.get("NAV_RCL_ACT")
+        if on_loss in _STICK_ACTIONS and without_sticks in _NO_ACTIONS:
+            raise FlightEnded(
+                Cause.REFUSED,
+                f"parameters COM_OBL_RC_ACT {on_loss:g} and NAV_RCL_ACT {without_sticks:g}: without sticks PX4 would go"
+                " on with the last setpoint when setpoints cease; set COM_OBL_RC_ACT to 5 (Hold), 4 (Land) or 3"
+                " (Return)",
             )
 
     def _gate_rate(self) -> None:

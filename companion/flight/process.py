@@ -12,6 +12,7 @@ import json
 import signal
 import socket
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,25 @@ class Status:
         self.send(progress=progress._asdict())
 
 
-def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: Status) -> int:
+class Signals:
+    """SIGINT, SIGTERM and SIGHUP: before there is a loop they end the process, afterwards they ask it to hand over."""
+
+    def __init__(self) -> None:
+        self._loop: FlightLoop | None = None
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._on_signal)
+
+    def hand_to(self, loop: FlightLoop) -> None:
+        """From now on the loop is told."""
+        self._loop = loop
+
+    def _on_signal(self, number: int, frame: object) -> None:
+        if self._loop is None:
+            raise KeyboardInterrupt
+        self._loop.interrupt()
+
+
+def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: Status, signals: Signals) -> int:
     """Flies the flight of a folder and writes record and summary into it. Returns the exit code."""
     path = folder / CONFIGURATION_FILE
     flight = build_flight(read_toml(path), str(path))
@@ -68,16 +87,20 @@ def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: St
     try:
         with Wire.open(connection, tap=recorder.offer) as wire:
             loop = FlightLoop(
-                flight, trajectory, wire, record, compiled, status.line, status.progress, connect_timeout_s=timeout_s
+                *(flight, trajectory, wire, record, compiled, status.line, status.progress),
+                connect_timeout_s=timeout_s,
+                connection=connection,
             )
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, lambda *_: loop.interrupt())
+            signals.hand_to(loop)
             status.send(ready=True)
             outcome = loop.run()
+            status.send(flown=True)
     finally:
         recorder.close()
     if recorder.problem:
         status.line(recorder.problem)
+    if outcome.fault:
+        print(outcome.fault, file=sys.stderr)
     return _finish(folder, flight, trajectory, record, outcome, status)
 
 
@@ -122,10 +145,17 @@ def main() -> int:
     folder, connection, engine, timeout, descriptor = sys.argv[1:]
     status = Status(socket.socket(fileno=int(descriptor)))
     try:
-        return fly(Path(folder), connection, engine, float(timeout), status)
+        return fly(Path(folder), connection, engine, float(timeout), status, Signals())
     except CompanionError as error:
         status.send(error=str(error))
         return int(error.exit_code)
+    except KeyboardInterrupt:
+        status.send(outcome=f"{Cause.INTERRUPTED.value.sentence}: before anything connected")
+        return int(ExitCode.INTERRUPTED)
+    except Exception as error:
+        traceback.print_exc()
+        status.send(outcome=f"{Cause.FAULT.value.sentence}: {type(error).__name__}: {error}")
+        return int(ExitCode.INTERNAL)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, 
 from companion.flight.preflight import Preflight
 from companion.frames import yaw_from_quat
 from companion.link import modes
+from companion.link.modes import Mode
 from companion.link.operations import Operation, Operations, Retry
 from companion.link.telemetry import VehicleState
 from companion.record.summary import PhaseChange
@@ -35,6 +36,14 @@ HANDOVER_INTERVAL_S = 0.1
 HANDOVER_TIMEOUT_S = 3.0
 CONFIRM_TIMEOUT_S = 2.5
 """HEARTBEAT comes once per second: the longest a mode change may take to be seen there."""
+START_SPEED_MAX_M_S = 1.0
+"""Faster, the vehicle does not hold, and there is no hold point to begin from."""
+START_TIMEOUT_S = 30.0
+REASON_WAIT_S = 0.5
+"""The autopilot's words about a refusal may come after its answer."""
+
+_AWAITED = {Phase.TAKEOFF: modes.TAKEOFF, Phase.LAND: modes.LAND}
+"""The autopilot's own modes that a phase asks for."""
 
 
 class Duty(Enum):
@@ -86,7 +95,14 @@ class Sequence:
         self._operation: Operation | None = None
         self._asked = False
         self._settled_since_s: float | None = None
+        self._mode_seen = False
+        self._mode_at_end: Mode | None = None
         self._confirmed_hold_s: float | None = None
+
+    @property
+    def owes_hold(self) -> bool:
+        """Whether the vehicle may be following our setpoints, or was asked for Hold and has not acknowledged it."""
+        return self.duty is not Duty.NOTHING or (self.ending is not None and self._confirmed_hold_s is None)
 
     # -- events ---------------------------------------------------------------------------------------------------
 
@@ -98,6 +114,7 @@ class Sequence:
         self._operation = None
         self._asked = False
         self._settled_since_s = None
+        self._mode_seen = False
         self._notify(f"{phase.value}: {reason}")
 
     def on_state(self, state: VehicleState, now_s: float) -> None:
@@ -115,6 +132,8 @@ class Sequence:
             FlightEnded: there is nothing more to do.
         """
         self._ops.update(now_s)
+        if self.ending is None:
+            self._watch_mode(now_s)
         if self.ending is not None:
             self._hand_over(now_s)
         elif self.phase is Phase.PREFLIGHT:
@@ -122,68 +141,113 @@ class Sequence:
                 self._after_preflight(now_s)
         elif self.phase is Phase.TAKEOFF:
             self._take_off(now_s)
+        elif self.phase is Phase.JOIN and self.duty is Duty.NOTHING:
+            self._hold_first(now_s)
         elif self.phase is Phase.JOIN and self.duty is Duty.STREAM:
             self._enter_offboard(now_s)
+        elif self.phase is Phase.HOLD:
+            self._finish(now_s)
         elif self.phase is Phase.LAND:
             self._land(now_s)
-        if self.ending is None and self.duty is Duty.TRACK:
-            self._watch_mode()
-            if self.phase is Phase.HOLD:
-                self._finish(now_s)
 
     def end(self, cause: Cause, detail: str, now_s: float) -> None:
         """Begins to hand over to the autopilot's Hold; the first cause stays."""
         if self.ending is not None:
             return
         self.ending = (cause, detail)
+        self._operation = None
         self._step_s = now_s - HANDOVER_INTERVAL_S
         self._since_s = now_s
+        self._mode_at_end = self._autopilot.mode
         self._notify(f"ending: {cause.value.sentence}" + (f": {detail}" if detail else ""))
         if self.duty is not Duty.TRACK:
             self.duty = Duty.NOTHING
-        if cause is Cause.TAKEN_OVER:  # somebody else has it: nothing more is asked for or sent
-            self.duty = Duty.NOTHING
-            raise FlightEnded(cause, detail)
+
+    def interrupt(self, now_s: float) -> None:
+        """The operator wants to stop.
+
+        Raises:
+            FlightEnded: nothing was asked of the vehicle yet, or it has landed: there is nothing to hand over.
+        """
+        if self.ending is not None:
+            return
+        if self.phase in {Phase.CONNECT, Phase.PREFLIGHT}:
+            raise FlightEnded(Cause.INTERRUPTED, "before anything was asked of the vehicle")
+        if self.phase is Phase.LAND and self._autopilot.landed is LandedState.ON_GROUND:
+            raise FlightEnded(Cause.INTERRUPTED, "the vehicle has landed")
+        self.end(Cause.INTERRUPTED, "", now_s)
 
     # -- phases ---------------------------------------------------------------------------------------------------
 
     def _after_preflight(self, now_s: float) -> None:
-        if self._autopilot.landed is LandedState.ON_GROUND or not self._autopilot.armed:
+        landed = self._autopilot.landed
+        if landed is LandedState.UNDEFINED:
+            raise FlightEnded(Cause.REFUSED, "the autopilot does not say whether it stands on the ground or flies")
+        if landed is LandedState.ON_GROUND or not self._autopilot.armed:
             self.enter(Phase.TAKEOFF, now_s, f"all gates passed; climbing to {self._flight.takeoff_altitude_m:g} m")
         else:
-            self._prepare_join(now_s, "all gates passed; the vehicle is in the air already")
+            self.enter(Phase.JOIN, now_s, "all gates passed; the vehicle is in the air already")
+            self._hold_first(now_s)
 
     def _take_off(self, now_s: float) -> None:
         """NAV_TAKEOFF, then arming, then waiting until the autopilot holds up there."""
         state = self._state
         if self._operation is None:
             self._operation = self._ops.takeoff(self._preflight.takeoff_amsl_m(state), now_s)
-        if self._operation.pending:
+        if self._operation.pending or self._refused(self._operation, now_s):
             return
-        if not self._operation.accepted:
-            raise FlightEnded(Cause.REFUSED, self._operation.sentence)
         if not self._asked:
             self._asked = True
             self._operation = self._ops.arm(now_s)
             return
         if now_s - self._since_s > TAKEOFF_TIMEOUT_S:
-            raise FlightEnded(Cause.REFUSED, f"no steady hold was reached within {TAKEOFF_TIMEOUT_S:g} s of take-off")
+            self.end(Cause.REFUSED, f"no steady hold was reached within {TAKEOFF_TIMEOUT_S:g} s of take-off", now_s)
+            return
         if not self._autopilot.armed and now_s - self._since_s > CONFIRM_TIMEOUT_S + 1.0:
-            raise FlightEnded(Cause.REFUSED, "the autopilot disarmed before it took off")
+            self.end(Cause.REFUSED, "the autopilot disarmed before it took off", now_s)
+            return
         steady = (
-            state is not None
-            and self._autopilot.mode == modes.HOLD
+            self._autopilot.mode == modes.HOLD
             and self._autopilot.landed is LandedState.IN_AIR
-            and max(abs(x) for x in state.v) < SETTLED_SPEED_M_S
+            and self._slower_than(SETTLED_SPEED_M_S)
         )
         if not steady:
             self._settled_since_s = None
         elif self._settled_since_s is None:
             self._settled_since_s = now_s
         elif now_s - self._settled_since_s >= SETTLED_FOR_S:
-            self._prepare_join(now_s, "the vehicle holds at its take-off height")
+            self.enter(Phase.JOIN, now_s, "the vehicle holds at its take-off height")
+            self._hold_first(now_s)
 
-    def _prepare_join(self, now_s: float, reason: str) -> None:
+    def _refused(self, operation: Operation, now_s: float) -> bool:
+        """Whether the autopilot refused what was asked; ends the flight with its reason, which may come a little
+        later."""
+        if operation.pending or operation.accepted:
+            return False
+        if now_s - (operation.ended_s or now_s) >= REASON_WAIT_S:
+            self.end(Cause.REFUSED, operation.sentence, now_s)
+        return True
+
+    def _slower_than(self, speed_m_s: float) -> bool:
+        return self._state is not None and max(abs(x) for x in self._state.v) < speed_m_s
+
+    def _hold_first(self, now_s: float) -> None:
+        """The vehicle must hold, and be meant to, before a setpoint is sent: PX4 goes back to OFFBOARD by itself at the
+        first one when that was the last mode asked for."""
+        autopilot = self._autopilot
+        if autopilot.mode == modes.HOLD and autopilot.intended in {None, modes.HOLD}:
+            known = autopilot.intended is not None or self._operation is not None
+            if known and self._slower_than(START_SPEED_MAX_M_S):
+                self._plan_course(now_s)
+                return
+        if self._operation is None and (autopilot.mode, autopilot.intended) != (modes.HOLD, modes.HOLD):
+            self._operation = self._ops.set_mode(modes.HOLD, now_s)
+        if self._operation is not None and self._refused(self._operation, now_s):
+            return
+        if now_s - self._since_s > START_TIMEOUT_S:
+            self.end(Cause.REFUSED, f"the vehicle does not hold still in Hold after {START_TIMEOUT_S:g} s", now_s)
+
+    def _plan_course(self, now_s: float) -> None:
         """Plans join and stop from where the vehicle is held, while the autopilot still has it."""
         state = self._state
         assert state is not None
@@ -194,7 +258,8 @@ class Sequence:
             )
         except RefusedError as error:
             raise FlightEnded(Cause.REFUSED, str(error)) from None
-        self.enter(Phase.JOIN, now_s, reason)
+        self._operation = None
+        self._since_s = now_s
         self.duty = Duty.STREAM
 
     def _enter_offboard(self, now_s: float) -> None:
@@ -203,8 +268,8 @@ class Sequence:
             return
         if self._operation is None:
             self._operation = self._ops.set_mode(modes.OFFBOARD, now_s, Retry(0.5, 8))
-        elif not self._operation.pending and not self._operation.accepted:
-            self.end(Cause.REFUSED, self._operation.sentence, now_s)
+        elif self._refused(self._operation, now_s):
+            return
         elif self._autopilot.mode == modes.OFFBOARD and self._operation.accepted and self._state is not None:
             assert self.course is not None
             self.duty = Duty.TRACK
@@ -248,36 +313,72 @@ class Sequence:
             self._operation = self._ops.land(now_s)
         elif self._operation.accepted:
             self.duty = Duty.NOTHING
-        elif not self._operation.pending:
-            self.end(Cause.REFUSED, self._operation.sentence, now_s)
+        elif self._refused(self._operation, now_s):
             return
         if self.duty is Duty.NOTHING and self._autopilot.landed is LandedState.ON_GROUND and not self._autopilot.armed:
             raise FlightEnded(Cause.COMPLETED, "landed and disarmed")
         if now_s - self._since_s > LANDING_TIMEOUT_S:
             raise FlightEnded(Cause.STATE_LOST, f"no landing was reported within {LANDING_TIMEOUT_S:g} s")
 
-    def _watch_mode(self) -> None:
-        """Leaving OFFBOARD by anybody else's hand ends the flight."""
+    # -- other hands ----------------------------------------------------------------------------------------------
+
+    def _watch_mode(self, now_s: float) -> None:
+        """A mode that this flight did not ask for is another hand's, or a failsafe's: it ends the flight at once.
+
+        Raises:
+            FlightEnded: nothing more is asked for or sent.
+        """
         mode = self._autopilot.mode
-        asked = self.phase is Phase.LAND and self._operation is not None
-        if mode is not None and mode != modes.OFFBOARD and not asked:
-            self.end(Cause.TAKEN_OVER, f"the autopilot reports {mode.label}", self._since_s)
+        if mode is None:
+            return
+        self._mode_seen = self._mode_seen or mode == _AWAITED.get(self.phase)
+        allowed = self._allowed_modes()
+        if allowed is None or mode in allowed:
+            return
+        self.duty = Duty.NOTHING
+        said = "; ".join(self._ops.texts.complaints(now_s - 1.0, now_s))
+        self._notify("another hand took the vehicle over: nothing more is sent")
+        raise FlightEnded(Cause.TAKEN_OVER, f"the autopilot reports {mode.label}" + (f" ({said})" if said else ""))
+
+    def _allowed_modes(self) -> set[Mode] | None:
+        """The modes that this flight's own requests lead to now; None for any."""
+        if self.phase is Phase.TAKEOFF:
+            return {modes.TAKEOFF, modes.HOLD} if self._mode_seen and self._autopilot.armed else None
+        if self.phase is Phase.LAND:
+            if not self._autopilot.armed:
+                return None
+            return {modes.LAND} if self._mode_seen else {modes.OFFBOARD, modes.LAND}
+        if self.duty is Duty.STREAM:
+            return {modes.HOLD} if self._operation is None else {modes.HOLD, modes.OFFBOARD}
+        return {modes.OFFBOARD} if self.duty is Duty.TRACK else None
 
     def _hand_over(self, now_s: float) -> None:
         """Asks for Hold every 100 ms until it is acknowledged, then waits until it is reported, then ends."""
         assert self.ending is not None
         cause, detail = self.ending
-        operation = self._operation
-        if self._confirmed_hold_s is None:
-            if operation is not None and operation.what.endswith(modes.HOLD.label) and operation.accepted:
-                self._confirmed_hold_s = now_s
-                self.duty = Duty.NOTHING
-            elif now_s - self._since_s > HANDOVER_TIMEOUT_S:
-                raise FlightEnded(
-                    cause, f"{detail}; Hold was not acknowledged, the autopilot's own failsafe acts".lstrip("; ")
-                )
-            elif now_s - self._step_s >= HANDOVER_INTERVAL_S - 1e-9:
-                self._step_s = now_s
-                self._operation = self._ops.set_mode(modes.HOLD, now_s, Retry(HANDOVER_INTERVAL_S, 1))
-        elif self._autopilot.mode == modes.HOLD or now_s - self._confirmed_hold_s > CONFIRM_TIMEOUT_S:
-            raise FlightEnded(cause, detail)
+        operation, mode = self._operation, self._autopilot.mode
+        if self._confirmed_hold_s is not None:
+            if mode == modes.HOLD or now_s - self._confirmed_hold_s > CONFIRM_TIMEOUT_S:
+                where = "the vehicle is in Hold" if mode == modes.HOLD else "Hold was acknowledged"
+                raise FlightEnded(cause, f"{detail}; {where}".lstrip("; "))
+        elif mode is not None and mode not in self._modes_to_leave():
+            self._give_up(f"the autopilot reports {mode.label} by another hand, nothing more is asked of it")
+        elif operation is not None and operation.accepted:
+            self._confirmed_hold_s = now_s
+            self.duty = Duty.NOTHING
+        elif now_s - self._since_s > HANDOVER_TIMEOUT_S:
+            self._give_up("Hold was not acknowledged, the autopilot's own failsafe acts")
+        elif now_s - self._step_s >= HANDOVER_INTERVAL_S - 1e-9:
+            self._step_s = now_s
+            self._operation = self._ops.set_mode(modes.HOLD, now_s, Retry(HANDOVER_INTERVAL_S, 1))
+
+    def _modes_to_leave(self) -> set[Mode | None]:
+        """The modes that Hold may be asked for in; any other was chosen by somebody else, and stays."""
+        return {modes.HOLD, modes.OFFBOARD, self._mode_at_end, _AWAITED.get(self.phase)}
+
+    def _give_up(self, why: str) -> None:
+        assert self.ending is not None
+        cause, detail = self.ending
+        self.duty = Duty.NOTHING
+        self._confirmed_hold_s = self._since_s
+        raise FlightEnded(cause, f"{detail}; {why}".lstrip("; "))

@@ -1,71 +1,204 @@
 """One control step as every flight makes it: predict, evaluate the law at the time of effect, remember what was sent.
 
 The same object flies over MAVLink (`flight.loop`) and in `companion simulate`; it knows nothing of sockets. Its time is
-the vehicle's.
+the vehicle's. The arithmetic is `control.model.advance` and `control.law.step` with either engine: called as they are,
+or compiled as one kernel.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from companion import accelerate
 from companion.config import Vehicle
+from companion.control import flat
 from companion.control.heading import HeadingState
-from companion.control.law import Command, ControllerState, Errors, Evaluation, lyapunov, start, step
-from companion.control.model import advance
-from companion.control.output import (
-    Conversion,
-    Setpoint,
-    actuator_output,
-    attitude_output,
-    rates_output,
-)
+from companion.control.law import ControllerState, Parameters, start, step
+from companion.control.model import Factors, advance, factors
+from companion.control.output import Conversion, Setpoint, actuator_output, attitude_output, rates_output
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.control.vectors import axes
-from companion.flight.prediction import Prediction
+from companion.flight.prediction import Piece, Prediction
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
+PIECES_MAX = 100
 ReferenceAt = Callable[[float], Reference]
+Numbers = tuple[float, ...]
+
+
+class Engine(Protocol):
+    """The arithmetic of the control steps, with the controller's state."""
+
+    def begin(self, controller: ControllerState) -> None:
+        """Takes a new controller state."""
+        ...
+
+    def step(
+        self,
+        state: State,
+        reference: Reference,
+        thrust: float,
+        pieces: list[Piece],
+        frozen: bool,
+        integrate: bool,
+        dt_s: float,
+    ) -> Numbers:
+        """One step; returns the numbers that `control.flat` names (flat.THRUST ...).
+
+        Args:
+            state: as received.
+            reference: at the time of effect.
+            thrust: that acts at the state's stamp [N].
+            pieces: what acts from the stamp to the time of effect.
+            frozen: hold the estimator still.
+            integrate: whether the controller's state goes on.
+            dt_s: since the last step [s].
+        """
+        ...
 
 
 class Kernels(NamedTuple):
-    """The functions of a control step, plain or compiled."""
+    """The engine of the control steps."""
 
-    step: Callable[..., tuple[Command, ControllerState, Evaluation]]
-    advance: Callable[..., Any]
     engine: str
+    """ "python" or "numba"."""
+    build: Callable[[Parameters, Factors], Engine]
 
 
 def kernels(engine: str) -> Kernels:
-    """The control step's functions for an engine: "python", "numba", or "auto" (numba where it is installed)."""
+    """The arithmetic for an engine: "python", "numba", or "auto" (numba where it is installed)."""
     chosen = accelerate.resolve(engine)
-    return Kernels(accelerate.choose(step, chosen), accelerate.choose(advance, chosen), chosen)
+    return Kernels(chosen, CompiledEngine if chosen == "numba" else PlainEngine)
+
+
+class PlainEngine:
+    """The control step as plain Python."""
+
+    def __init__(self, parameters: Parameters, lags: Factors) -> None:
+        self._parameters = parameters
+        self._vehicle = (parameters.model.mass, parameters.model.gravity, parameters.model.drag)
+        self._lags = lags
+        self._controller: ControllerState | None = None
+
+    def begin(self, controller: ControllerState) -> None:
+        """Takes a new controller state."""
+        self._controller = controller
+
+    def step(
+        self,
+        state: State,
+        reference: Reference,
+        thrust: float,
+        pieces: list[Piece],
+        frozen: bool,
+        integrate: bool,
+        dt_s: float,
+    ) -> Numbers:
+        """One step (see Engine)."""
+        controller = self._controller
+        assert controller is not None
+        for setpoint, rates, duration_s in pieces:
+            state, thrust = advance(
+                state, thrust, rates, setpoint, controller.b_hat, self._vehicle, self._lags, duration_s
+            )
+        command, after, out = step(state, reference, controller, self._parameters, frozen, dt_s)
+        if integrate:
+            self._controller = after
+        else:
+            after = controller
+        return flat.results(command, after, out, self._parameters.gains.p_max, state)
+
+
+class CompiledEngine:
+    """The control step compiled as one kernel over arrays that are allocated once."""
+
+    def __init__(self, parameters: Parameters, lags: Factors) -> None:
+        import numpy as np
+
+        self._kernel: Any = accelerate.compile_kernel(flat.control_step)
+        self._x = np.zeros(flat.PIECES + flat.PIECE * PIECES_MAX)
+        self._y = np.zeros(flat.RESULTS)
+        self._c = np.array(flat.constants(parameters, lags))
+        self._bytes = self._x.data.cast("B")
+        self._result = self._y.data.cast("B")
+        self._pack = struct.Struct(f"{flat.INPUTS}d").pack_into
+        self._pack_piece = struct.Struct(f"{flat.PIECE}d").pack_into
+        self._unpack = struct.Struct(f"{flat.RESULTS}d").unpack_from
+
+    def begin(self, controller: ControllerState) -> None:
+        """Takes a new controller state."""
+        self._x[flat.CONTROLLER : flat.PIECES] = flat.controller_numbers(controller)
+
+    def step(
+        self,
+        state: State,
+        reference: Reference,
+        thrust: float,
+        pieces: list[Piece],
+        frozen: bool,
+        integrate: bool,
+        dt_s: float,
+    ) -> Numbers:
+        """One step (see Engine)."""
+        p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
+        self._pack(
+            self._bytes, 0, *state.p, *state.v, *state.q, *state.w, *p, *v, *a, *j, *s, yaw, yaw_rate, yaw_acceleration,
+            thrust, dt_s, frozen, len(pieces), integrate,
+        )  # fmt: skip
+        at = 8 * flat.PIECES
+        for setpoint, rates, duration_s in pieces:
+            self._pack_piece(self._bytes, at, setpoint, *rates, duration_s)
+            at += 8 * flat.PIECE
+        self._kernel(self._x, self._c, self._y)
+        return self._unpack(self._result)
 
 
 class TrackerStep(NamedTuple):
     """What one control step did."""
 
     setpoint: Setpoint
-    command: Command
-    errors: Errors
-    heading_error: float
-    predicted: State
+    numbers: Numbers
+    """Everything else, in the order that `control.flat` names."""
+
+    @property
+    def errors(self) -> tuple[Vec3, Vec3, Vec3, Vec3]:
+        """e1 to e4 at the time of effect [m]."""
+        n = self.numbers[flat.ERRORS]
+        return (n[0], n[1], n[2]), (n[3], n[4], n[5]), (n[6], n[7], n[8]), (n[9], n[10], n[11])
+
+    @property
+    def rates(self) -> Vec3:
+        """Body rate setpoint [rad/s]."""
+        n = self.numbers
+        return (n[1], n[2], n[3])
+
+    @property
+    def tau(self) -> Vec3:
+        """Angular acceleration [rad/s^2]."""
+        n = self.numbers
+        return (n[7], n[8], n[9])
+
+    @property
+    def b_hat(self) -> Vec3:
+        """Disturbance estimate after the step, NED [m/s^2]."""
+        n = self.numbers
+        return (n[13], n[14], n[15])
 
 
 def conversion(vehicle: Vehicle) -> Conversion:
     """The vehicle's normalisation; full torque is what the rotors give with half of them at full command, per axis."""
     rotors = vehicle.rotors
-    arms = (rotors.y_m, rotors.x_m, rotors.yaw_moment_m)
     half = 0.5 * rotors.thrust_max_n
-    torque_full = tuple(half * sum(abs(arm) for arm in axis) for axis in arms)
+    x, y, z = (half * sum(abs(arm) for arm in axis) for axis in (rotors.y_m, rotors.x_m, rotors.yaw_moment_m))
     return Conversion(
         vehicle.thrust_full_n,
         rotors.curve_factor,
         vehicle.autopilot.attitude_gain_1_s,
         vehicle.autopilot.attitude_lag_s,
         vehicle.body.inertia_kg_m2,
-        (torque_full[0], torque_full[1], torque_full[2]),
+        (x, y, z),
     )
 
 
@@ -75,30 +208,28 @@ class Tracker:
     Args:
         vehicle: the vehicle file.
         output: "rates", "attitude" or "actuators".
-        compiled: the kernels to use.
+        compiled: the engine.
     """
 
     def __init__(self, vehicle: Vehicle, output: str, compiled: Kernels) -> None:
         self.vehicle = vehicle
         self.parameters = vehicle.parameters()
         self._output = output
-        self._kernels = compiled
+        x, y, z = vehicle.autopilot.rate_lag_s
         self._conversion = conversion(vehicle)
         self._interval_s = 1.0 / vehicle.link.state_rate_hz
         self._gap_max_s = vehicle.limits.state_gap_max_s
         self._last_s: float | None = None
         self.delay_s = vehicle.delay_s if vehicle.controller.prediction else 0.0
-        self.controller = ControllerState(0.0, 0.0, ZERO, HeadingState((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), False), ZERO)
         self._prediction = self._new_prediction(0.0)
+        length = self._prediction.length_s or self._interval_s
+        self._engine = compiled.build(self.parameters, factors((x, y, z, vehicle.rotors.lag_s), length))
 
     def _new_prediction(self, thrust_n: float) -> Prediction:
-        x, y, z = self.vehicle.autopilot.rate_lag_s
-        lags = (x, y, z, self.vehicle.rotors.lag_s)
-        return Prediction(self.parameters, lags, self.delay_s, thrust_n, self._kernels.advance)
+        return Prediction(self.vehicle.rotors.lag_s, self.delay_s, thrust_n)
 
     def begin(self, state: State, thrust_n: float | None = None) -> None:
-        """Starts the controller's state from a hover: T(0), T'(0) = 0, b_hat(0) so that nothing steps (paper.md section
-        8).
+        """Starts the controller's state from a hover: T(0), T'(0) = 0 and b_hat(0) such that nothing steps (section 8).
 
         Args:
             state: the vehicle now.
@@ -107,11 +238,11 @@ class Tracker:
         model, limits = self.parameters.model, self.parameters.limits
         thrust = model.mass * GRAVITY_M_S2 if thrust_n is None else thrust_n
         thrust = min(max(thrust, limits.thrust_min), limits.thrust_max)
-        b_hat: Vec3 = (0.0, 0.0, 0.0)
+        b_hat: Vec3 = ZERO
         if self.vehicle.controller.disturbance_start == "hover":
             _, b_hat = start(thrust, state.q, model.mass, model.gravity, limits.disturbance_max)
         r1, r2, _ = axes(state.q)
-        self.controller = ControllerState(thrust, 0.0, b_hat, HeadingState(r2, r1, False), ZERO)
+        self._engine.begin(ControllerState(thrust, 0.0, b_hat, HeadingState(r2, r1, False), ZERO))
         self._prediction = self._new_prediction(thrust)
         self._last_s = None
 
@@ -131,25 +262,18 @@ class Tracker:
             if dt > self._gap_max_s:  # too long to integrate over: the controller's state waits
                 dt, integrate = self._interval_s, False
         self._last_s = stamp_s
-        predicted = self._prediction.predict(stamp_s, state, self.controller.b_hat)
+        prediction = self._prediction
+        pieces = prediction.pieces(stamp_s)
         reference = reference_at(stamp_s + self.delay_s)
-        command, after, evaluation = self._kernels.step(
-            predicted, reference, self.controller, self.parameters, frozen or not integrate, dt
-        )
-        if integrate:
-            self.controller = after
-        self._prediction.sent(stamp_s, command)
-        return TrackerStep(
-            self._convert(command, predicted), command, evaluation.errors, evaluation.heading_error, predicted
-        )
+        numbers = self._engine.step(state, reference, prediction.thrust, pieces, frozen or not integrate, integrate, dt)
+        prediction.sent(stamp_s, numbers[flat.THRUST], numbers[flat.RATES_MODEL])
+        return TrackerStep(self._convert(numbers), numbers)
 
-    def _convert(self, command: Command, predicted: State) -> Setpoint:
+    def _convert(self, n: Numbers) -> Setpoint:
+        rates = (n[1], n[2], n[3])
+        if self._output == "rates":
+            return rates_output(n[flat.THRUST], rates, self._conversion)
+        tau, w = (n[7], n[8], n[9]), (n[34], n[35], n[36])
         if self._output == "attitude":
-            return attitude_output(command, predicted.q, predicted.w, self._conversion)
-        if self._output == "actuators":
-            return actuator_output(command, predicted.w, self._conversion)
-        return rates_output(command, self._conversion)
-
-    def lyapunov(self, errors: Errors) -> float:
-        """V_H of the last step without its b_tilde term [m^2]."""
-        return lyapunov(errors, self.parameters.gains.p_max)
+            return attitude_output(n[flat.THRUST], rates, tau, (n[30], n[31], n[32], n[33]), w, self._conversion)
+        return actuator_output(n[flat.THRUST], tau, w, self._conversion)

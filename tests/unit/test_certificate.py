@@ -114,5 +114,5 @@ def test_the_delay_margin_holds_on_the_simulated_vehicle(extra_s, flies):
         return
     finally:
         simulate.simulated_vehicle = simulated
-    late = [np.linalg.norm(row.errors.e1) for row in trace.rows if row.t_s > 6.0]
+    late = [np.linalg.norm(row.errors[0]) for row in trace.rows if row.t_s > 6.0]
     assert (max(late) < 0.15) == flies

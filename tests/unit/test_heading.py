@@ -47,6 +47,10 @@ def test_yaw_rate_and_its_derivative_agree_with_finite_differences(force, forwar
     assert now.w3d_rate == pytest.approx((after.w3d - before.w3d) / (2 * h), abs=1e-5 * scale)
 
 
+def torque(state, *arguments):
+    return heading.heading_torque(state, *arguments, axes(state.q))
+
+
 def level(yaw, w3=0.0):
     return State(ZERO, ZERO, quat_exp((0.0, 0.0, yaw)), (0.0, 0.0, w3))
 
@@ -61,7 +65,7 @@ GAINS = (1.0, 1.0, 2.0)
 
 @given(path=numbers(-3.1, 3.1), off=numbers(-3.0, 3.0))
 def test_sideslip_turns_the_nose_towards_the_path(path, off):
-    tau3, _, error = heading.heading_torque(
+    tau3, _, error = torque(
         level(path + off),
         moving((math.cos(path), math.sin(path), 0.0)),
         GRAVITY,
@@ -78,21 +82,19 @@ def test_sideslip_turns_the_nose_towards_the_path(path, off):
 @given(yaw=numbers(-3.1, 3.1), off=numbers(-1.5, 1.5), rate=numbers(-1.0, 1.0), acceleration=numbers(-1.0, 1.0))
 def test_commanded_heading_feeds_rate_and_acceleration_forward(yaw, off, rate, acceleration):
     ref = Reference(ZERO, ZERO, ZERO, ZERO, ZERO, yaw, rate, acceleration)
-    tau3, _, error = heading.heading_torque(level(yaw, rate), ref, GRAVITY, memory(), COMMANDED, GAINS, (9.0, 0.1), 0.0)
+    tau3, _, error = torque(level(yaw, rate), ref, GRAVITY, memory(), COMMANDED, GAINS, (9.0, 0.1), 0.0)
     assert tau3 == pytest.approx(acceleration, abs=1e-9) and error == pytest.approx(0.0, abs=1e-9)
-    _, _, error = heading.heading_torque(level(yaw + off), ref, GRAVITY, memory(), COMMANDED, GAINS, (9.0, 0.1), 0.0)
+    _, _, error = torque(level(yaw + off), ref, GRAVITY, memory(), COMMANDED, GAINS, (9.0, 0.1), 0.0)
     assert error == pytest.approx(off, abs=1e-9)
 
 
 def test_damping_and_missing_thrust_direction_only_damp():
-    tau3, after, error = heading.heading_torque(
+    tau3, after, error = torque(
         level(0.3, 0.5), moving((1.0, 0.0, 0.0)), GRAVITY, memory(), DAMPING, GAINS, (1.0, 0.1), 0.01
     )
     assert tau3 == -1.0 and after == memory() and math.isnan(error)
     weak = ((0.0, 0.0, 0.1), ZERO, ZERO)
-    tau3, after, _ = heading.heading_torque(
-        level(0.3, 0.5), moving((1.0, 0.0, 0.0)), weak, memory(), SIDESLIP, GAINS, (1.0, 0.1), 0.01
-    )
+    tau3, after, _ = torque(level(0.3, 0.5), moving((1.0, 0.0, 0.0)), weak, memory(), SIDESLIP, GAINS, (1.0, 0.1), 0.01)
     assert tau3 == -1.0 and after == memory()
 
 
@@ -100,19 +102,13 @@ def test_slow_path_holds_the_last_direction_with_hysteresis():
     """Held below 0.3 m/s, left at 0.6 m/s; a vertical climb has speed and no direction."""
     m = memory()
     east = HeadingState((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), False)
-    _, m, error = heading.heading_torque(
-        level(math.pi / 2), moving((0.0, 0.2, -3.0)), GRAVITY, east, SIDESLIP, GAINS, (9.0, 0.3), 0.01
-    )
+    _, m, error = torque(level(math.pi / 2), moving((0.0, 0.2, -3.0)), GRAVITY, east, SIDESLIP, GAINS, (9.0, 0.3), 0.01)
     assert m.held and m.forward == pytest.approx((0.0, 1.0, 0.0)) and error == pytest.approx(0.0)
-    _, m, error = heading.heading_torque(
-        level(math.pi / 2), moving((0.5, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01
-    )
+    _, m, error = torque(level(math.pi / 2), moving((0.5, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01)
     assert m.held and error == pytest.approx(0.0)
-    _, m, _ = heading.heading_torque(
-        level(math.pi / 2), moving((0.7, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01
-    )
+    _, m, _ = torque(level(math.pi / 2), moving((0.7, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01)
     assert not m.held
-    _, m, _ = heading.heading_torque(level(0.0), moving((0.4, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01)
+    _, m, _ = torque(level(0.0), moving((0.4, 0.0, 0.0)), GRAVITY, m, SIDESLIP, GAINS, (9.0, 0.3), 0.01)
     assert not m.held
 
 
@@ -122,7 +118,7 @@ def test_the_rate_limit_turns_the_direction_no_faster_and_the_shorter_way(target
     ref = moving((math.cos(target), math.sin(target), 0.0))
     angle, steps = 0.0, 0
     while abs(angle - target) > 1e-9 and steps < 1000:
-        _, m, _ = heading.heading_torque(state, ref, GRAVITY, m, SIDESLIP, GAINS, (limit, 0.1), dt)
+        _, m, _ = torque(state, ref, GRAVITY, m, SIDESLIP, GAINS, (limit, 0.1), dt)
         new = math.atan2(-m.r2d[0], m.r2d[1])
         assert abs(new - angle) <= limit * dt + 1e-12
         assert (new - angle) * target >= 0.0

@@ -1,0 +1,145 @@
+"""One whole control step, prediction included, on flat arrays: what the compiled engine calls.
+
+Nested tuples are expensive to hand to compiled code (some 30 us for a step), a few arrays of floats are not. The
+function is a kernel like the others and calls the very same `model.advance` and `law.step`; with lists instead of
+arrays it runs as plain Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import MutableSequence, Sequence
+
+from companion.control.heading import HeadingState
+from companion.control.law import (
+    Command,
+    ControllerState,
+    Evaluation,
+    Gains,
+    Limits,
+    Model,
+    Parameters,
+    lyapunov,
+    step,
+)
+from companion.control.model import Factors, advance
+from companion.control.types import Reference, State
+
+PIECE = 5
+"""Numbers of a piece of the prediction: thrust setpoint, three rates, duration."""
+INPUTS = 36
+"""Input numbers before the controller's state."""
+CONTROLLER = INPUTS
+"""Where the controller's state stands in the input; the step replaces it."""
+PIECES = CONTROLLER + 15
+"""Where the pieces begin."""
+CONSTANTS = 36
+
+# where things stand in the results
+THRUST = 0
+RATES = slice(1, 4)
+RATES_MODEL = slice(4, 7)
+TAU = slice(7, 10)
+LIMITS = 10
+TOTAL = 11
+TOTAL_RATE = 12
+B_HAT = slice(13, 16)
+ERRORS = slice(16, 28)
+HEADING_ERROR = 28
+LYAPUNOV = 29
+PREDICTED_Q = slice(30, 34)
+PREDICTED_W = slice(34, 37)
+RESULTS = 37
+
+
+def constants(parameters: Parameters, lags: Factors) -> list[float]:
+    """The CONSTANTS numbers of a control step in the order that `control_step` reads them."""
+    g, m, lim = parameters
+    return [
+        *(g.k1, g.k2, g.k3, g.k4, g.gamma, g.p_max, float(g.heading_kind), g.l1, g.l2, g.damping),
+        *(m.mass, m.gravity, m.drag, *m.rate_lag, *m.rate_integral, m.thrust_lag),
+        *(lim.thrust_min, lim.thrust_max, *lim.rate_max),
+        *(lim.disturbance_max, lim.heading_rate_max, lim.heading_speed_min),
+        *lags,
+    ]
+
+
+def controller_numbers(c: ControllerState) -> tuple[float, ...]:
+    """The controller's state as 15 numbers."""
+    h = c.heading
+    return (c.thrust, c.thrust_rate, *c.b_hat, *h.r2d, *h.forward, float(h.held), *c.lead_integral)
+
+
+def control_step(x: MutableSequence[float], c: Sequence[float], y: MutableSequence[float]) -> None:
+    """Predicts the state through the pieces, computes one law step, and replaces the controller's state.
+
+    Args:
+        x: state 13, reference 18, thrust at the stamp, dt, frozen (0 or 1), number of pieces, whether to integrate (0
+        or 1), then the
+            controller's state 15 (T, T', b_hat, r2d, forward, held, lead integral), then PIECE numbers per piece.
+        c: `constants`.
+        y: gets RESULTS numbers, see the names above.
+    """
+    state = State((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8], x[9]), (x[10], x[11], x[12]))
+    ref = Reference(
+        (x[13], x[14], x[15]),
+        (x[16], x[17], x[18]),
+        (x[19], x[20], x[21]),
+        (x[22], x[23], x[24]),
+        (x[25], x[26], x[27]),
+        x[28],
+        x[29],
+        x[30],
+    )
+    b_hat = (x[38], x[39], x[40])
+    memory = HeadingState((x[41], x[42], x[43]), (x[44], x[45], x[46]), x[47] > 0.5)
+    controller = ControllerState(x[36], x[37], b_hat, memory, (x[48], x[49], x[50]))
+    gains = Gains(c[0], c[1], c[2], c[3], c[4], c[5], int(c[6]), c[7], c[8], c[9])
+    model = Model(c[10], c[11], c[12], (c[13], c[14], c[15]), (c[16], c[17], c[18]), c[19])
+    limits = Limits(c[20], c[21], (c[22], c[23], c[24]), c[25], c[26], c[27])
+    lags = (c[28], c[29], c[30], c[31], c[32], c[33], c[34], c[35])
+    thrust = x[31]
+    for i in range(int(x[34])):
+        j = PIECES + PIECE * i
+        rates = (x[j + 1], x[j + 2], x[j + 3])
+        state, thrust = advance(state, thrust, rates, x[j], b_hat, (c[10], c[11], c[12]), lags, x[j + 4])
+    command, after, out = step(state, ref, controller, Parameters(gains, model, limits), x[33] > 0.5, x[32])
+    if x[35] < 0.5:
+        after = controller
+    e = out.errors
+    y[0] = command.thrust
+    y[10] = float(command.limits)
+    y[11] = after.thrust
+    y[12] = after.thrust_rate
+    y[28] = out.heading_error
+    y[29] = lyapunov(e, gains.p_max)
+    y[30], y[31], y[32], y[33] = state.q
+    x[36] = after.thrust
+    x[37] = after.thrust_rate
+    x[47] = 1.0 if after.heading.held else 0.0
+    for i in range(3):
+        y[1 + i] = command.rates[i]
+        y[4 + i] = command.rates_model[i]
+        y[7 + i] = command.tau[i]
+        y[13 + i] = after.b_hat[i]
+        y[16 + i] = e.e1[i]
+        y[19 + i] = e.e2[i]
+        y[22 + i] = e.e3[i]
+        y[25 + i] = e.e4[i]
+        y[34 + i] = state.w[i]
+        x[38 + i] = after.b_hat[i]
+        x[41 + i] = after.heading.r2d[i]
+        x[44 + i] = after.heading.forward[i]
+        x[48 + i] = after.lead_integral[i]
+
+
+def results(
+    command: Command, after: ControllerState, out: Evaluation, p_max: float, predicted: State
+) -> tuple[float, ...]:
+    """The RESULTS numbers of a step that was computed with nested tuples."""
+    e = out.errors
+    return (
+        *(command.thrust, *command.rates, *command.rates_model, *command.tau, float(command.limits)),
+        *(after.thrust, after.thrust_rate, *after.b_hat),
+        *(*e.e1, *e.e2, *e.e3, *e.e4, out.heading_error, lyapunov(e, p_max)),
+        *(*predicted.q, *predicted.w),
+    )

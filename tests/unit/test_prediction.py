@@ -1,0 +1,86 @@
+"""The prediction over the delay: which command acts when, and where that brings the vehicle."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from companion.control.model import advance, factors, lagged
+from companion.control.types import State
+from companion.control.vectors import axes, quat_exp, quat_multiply, quat_normalise
+from companion.flight.prediction import PIECE_MAX_S, Prediction
+
+LAGS = (0.04, 0.05, 0.08, 0.05)
+VEHICLE = (2.0, 9.81, 0.3)
+
+
+def test_the_model_agrees_with_an_integrated_rigid_body():
+    state = State((1.0, 2.0, -3.0), (0.5, -0.2, 0.1), quat_exp((0.2, -0.1, 0.4)), (0.3, -0.5, 0.2))
+    rates, thrust, setpoint, b = (1.5, -1.0, 0.4), 20.0, 24.0, (0.3, -0.2, 0.1)
+
+    def rhs(_, y):
+        q, w, t = y[6:10], y[10:13], y[13]
+        r3 = np.array(axes(quat_normalise(tuple(q)))[2])
+        a = np.array(b) + np.array([0, 0, 9.81]) - 0.3 * y[3:6] - t / 2.0 * r3
+        q_rate = 0.5 * np.array(quat_multiply(tuple(q), (0.0, *w)))
+        w_rate = (np.array(rates) - w) / np.array(LAGS[:3])
+        return np.concatenate([y[3:6], a, q_rate, w_rate, [(setpoint - t) / LAGS[3]]])
+
+    start = np.concatenate([*state, [thrust]])
+    errors = []
+    for dt in (0.02, 0.01):
+        exact = solve_ivp(rhs, (0, dt), start, rtol=1e-12, atol=1e-12).y[:, -1]
+        got, got_thrust = advance(state, thrust, rates, setpoint, b, VEHICLE, factors(LAGS, dt), dt)
+        errors.append(np.abs(np.concatenate([*got, [got_thrust]]) - exact))
+    assert errors[0][10:].max() < 1e-9  # rates and thrust are exact
+    assert errors[1].max() < 0.22 * errors[0].max()  # the rest: local errors of third order
+    assert errors[1][:3].max() < 1e-5
+
+
+@given(
+    delay=st.floats(0.001, 0.09),
+    interval=st.floats(0.003, 0.03),
+    jitter=st.lists(st.floats(0.7, 1.4), min_size=30, max_size=30),
+)
+def test_pieces_cover_the_delay_with_the_commands_in_their_order(delay, interval, jitter):
+    """The integral of the commands over any delay is that of the piecewise constant history."""
+    prediction = Prediction(0.05, delay, 10.0)
+    stamp, history = 1.0, []
+    for i, factor in enumerate(jitter):
+        pieces = prediction.pieces(stamp)
+        if history:
+            assert sum(p[2] for p in pieces) == pytest.approx(delay)
+            assert max(p[2] for p in pieces) <= PIECE_MAX_S + 1e-9
+            total = sum(p[1][0] * p[2] for p in pieces)
+            expected = 0.0
+            for k, (since, value) in enumerate(history):
+                end = history[k + 1][0] if k + 1 < len(history) else math.inf
+                begin = since if k else -math.inf  # the first command stands for what acted before it
+                expected += value * max(0.0, min(end, stamp + delay) - max(begin, stamp))
+            assert total == pytest.approx(expected, abs=1e-4 * delay + 1e-6 * 30)
+        else:
+            assert pieces == []
+        prediction.sent(stamp, 10.0 + i, (float(i), 0.0, 0.0))
+        history.append((stamp + delay, float(i)))
+        stamp += interval * factor
+
+
+def test_the_thrust_at_the_stamp_is_followed_with_the_lag():
+    prediction = Prediction(0.05, 0.0, 10.0)
+    stamp, expected = 0.0, 10.0
+    for i in range(50):
+        prediction.pieces(stamp)
+        assert prediction.thrust == pytest.approx(expected)
+        setpoint = 10.0 + math.sin(0.3 * i)
+        prediction.sent(stamp, setpoint, (0.0, 0.0, 0.0))
+        expected = lagged(expected, setpoint, 0.05, 0.01)[0]
+        stamp += 0.01
+
+
+def test_without_delay_nothing_is_predicted():
+    prediction = Prediction(0.05, 0.0, 10.0)
+    prediction.sent(1.0, 11.0, (1.0, 0.0, 0.0))
+    assert prediction.pieces(1.01) == []

@@ -1,0 +1,84 @@
+"""The control step as the loop calls it: both engines give the same numbers; gaps are not integrated over."""
+
+import random
+
+import pytest
+
+from companion import accelerate
+from companion.config import load_flight, load_vehicle
+from companion.control import flat
+from companion.control.types import State
+from companion.control.vectors import quat_normalise
+from companion.flight.course import Course, at_rest
+from companion.flight.tracker import Tracker, kernels
+from companion.trajectory.load import load
+
+needs_numba = pytest.mark.skipif(not accelerate.available(), reason="numba is not installed")
+
+
+def random_state(rng: random.Random, near: float) -> State:
+    def vec(size):
+        return (rng.uniform(-size, size), rng.uniform(-size, size), rng.uniform(-size, size))
+
+    q = quat_normalise((1.0, rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), rng.uniform(-2, 2)))
+    x, y, z = vec(near)
+    return State((x, y, z - 10.0), vec(3.0), q, vec(1.0))
+
+
+@needs_numba
+@pytest.mark.parametrize("output", ["rates", "attitude", "actuators"])
+@pytest.mark.parametrize("heading", ["damping", "sideslip", "commanded"])
+def test_both_engines_give_the_same_numbers(output, heading):
+    vehicle = load_vehicle("paper", {"controller": {"heading": heading}})
+    course = Course(load("paper"), vehicle, (0.0, 0.0, -10.0), 0.0, None)
+    trackers = [Tracker(vehicle, output, kernels(engine)) for engine in ("python", "numba")]
+    rng = random.Random(heading + output)
+    for tracker in trackers:
+        tracker.begin(State((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    stamp = 1.0
+    for i in range(300):
+        # steps of every kind: near and far, limits, short and too long gaps, frozen
+        stamp += 0.5 if i % 97 == 96 else rng.choice([0.004, 0.004, 0.008, 0.02])
+        state = random_state(rng, rng.choice([0.5, 4.0, 40.0]))
+        frozen = i % 13 == 0
+        plain, compiled = (t.step(stamp, state, lambda s: course.at(s - 1.0), frozen=frozen) for t in trackers)
+        scale = [1.0 + abs(x) for x in plain.numbers]
+        for a, b, size in zip(plain.numbers, compiled.numbers, scale, strict=True):
+            assert a == pytest.approx(b, abs=1e-12 * size, nan_ok=True)
+        assert plain.setpoint[0] == pytest.approx(compiled.setpoint[0], abs=1e-12)
+
+
+def test_a_gap_is_not_integrated_over():
+    vehicle = load_vehicle("paper")
+    tracker = Tracker(vehicle, "rates", kernels("python"))
+    state = State((1.0, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    tracker.begin(state)
+    hold = at_rest((0.0, 0.0, -10.0), 0.0)
+    first = tracker.step(1.0, state, lambda t: hold).numbers
+    after_gap = tracker.step(1.0 + vehicle.limits.state_gap_max_s + 0.01, state, lambda t: hold).numbers
+    assert after_gap[flat.TOTAL] == first[flat.TOTAL] and after_gap[flat.B_HAT] == first[flat.B_HAT]
+    assert int(after_gap[flat.LIMITS]) & 32
+    going_on = tracker.step(1.0 + vehicle.limits.state_gap_max_s + 0.014, state, lambda t: hold).numbers
+    assert going_on[flat.TOTAL] != first[flat.TOTAL]
+
+
+def test_begin_takes_the_estimate_from_the_hover_or_from_zero():
+    state = State((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), quat_normalise((1.0, 0.0, 0.05, 0.0)), (0.0, 0.0, 0.0))
+    hold = at_rest(state.p, 0.0)
+    for start, expected in (("hover", True), ("zero", False)):
+        tracker = Tracker(
+            load_vehicle("paper", {"controller": {"disturbance_start": start}}), "rates", kernels("python")
+        )
+        tracker.begin(state)
+        out = tracker.step(1.0, state, lambda t: hold)
+        assert (abs(out.b_hat[0]) > 0.5) == expected
+
+
+def test_the_reference_is_taken_at_the_time_of_effect():
+    flight = load_flight("paper")
+    tracker = Tracker(flight.vehicle, "rates", kernels("python"))
+    state = State((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    tracker.begin(state)
+    asked = []
+    tracker.step(5.0, state, lambda t: asked.append(t) or at_rest(state.p, 0.0))
+    assert asked == [pytest.approx(5.0 + flight.vehicle.link.state_age_s)]
