@@ -2,32 +2,45 @@
 PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python
-# pip reads the pins for the package's own build requirements from here as well.
-export PIP_CONSTRAINT := constraints.txt
-export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-plain lint format bench clean help
+# pip takes the pins from here, for the package and (by the second name, which older versions do not know) for what
+# builds it. What the caller's own settings say about where and what to install does not hold for $(VENV).
+export PIP_CONSTRAINT := constraints.txt
+export PIP_BUILD_CONSTRAINT := constraints.txt
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_USER := 0
+unexport PIP_TARGET PIP_PREFIX PIP_ROOT PIP_REQUIREMENT PIP_EDITABLE PIP_NO_DEPS PIP_DRY_RUN
+unexport PIP_NO_BUILD_ISOLATION PIP_REQUIRE_HASHES PYTHONHOME PYTHONPATH
+
+.NOTPARALLEL:
+.PHONY: demo test test-plain lint format clean help
+
 help:  ## List the targets
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1: \2/p' Makefile
 
 $(PY):
-	$(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or later is needed: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
 # A stamp per set of packages: a second run installs nothing until the pins or the package's own needs change.
 $(VENV)/.run: pyproject.toml constraints.txt | $(PY)
-	$(PY) -m pip install -q -c constraints.txt -e .
+	@echo "installing into $(VENV) ..."
+	@$(PY) -m pip install -q -e .
 	@touch $@
 
-$(VENV)/.test: $(VENV)/.run
-	$(PY) -m pip install -q -c constraints.txt -e '.[test,fast]'
-	@touch $@
+$(VENV)/.test: pyproject.toml constraints.txt | $(PY)
+	@echo "installing into $(VENV), with what the tests need ..."
+	@$(PY) -m pip install -q -e '.[test,fast]'
+	@touch $(VENV)/.run $@
 
-$(VENV)/.lint: $(VENV)/.run
-	$(PY) -m pip install -q -c constraints.txt -e '.[lint]'
-	@touch $@
+$(VENV)/.lint: pyproject.toml constraints.txt | $(PY)
+	@echo "installing into $(VENV), with what the checks need ..."
+	@$(PY) -m pip install -q -e '.[test,fast,lint]'
+	@touch $(VENV)/.run $(VENV)/.test $@
 
 demo: $(VENV)/.run  ## Fly the paper's figure of eight on the bundled vehicle
-	$(VENV)/bin/python -m companion demo
+	$(PY) -m companion demo
 
 test: $(VENV)/.test  ## Run the tests
 	$(PY) -m pytest
@@ -35,7 +48,7 @@ test: $(VENV)/.test  ## Run the tests
 test-plain: $(VENV)/.test  ## Run the tests as they run where numba is not installed
 	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest
 
-lint: $(VENV)/.lint $(VENV)/.test  ## Style, types and import rules
+lint: $(VENV)/.lint  ## Check style, types and import rules
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
@@ -46,4 +59,4 @@ format: $(VENV)/.lint  ## Rewrite the code in the project's style
 	$(PY) -m ruff check --fix .
 
 clean:  ## Remove what the targets above made
-	rm -rf $(VENV) build dist flights
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -29,6 +29,10 @@ COMMANDS = {
 """Every command with its line in `companion --help`; the module companion.cli.NAME holds it."""
 
 
+USAGE_ERROR: Any = typer.BadParameter.__base__
+"""What the parser raises for an option or a name that it does not know; typer does not export it under its name."""
+
+
 class LazyGroup(TyperGroup):
     """Knows the commands by name and imports the one that is asked for."""
 
@@ -36,12 +40,15 @@ class LazyGroup(TyperGroup):
         """All commands, in the order of COMMANDS."""
         return list(COMMANDS)
 
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The overview, from COMMANDS alone: no command is imported for it."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command of that name, or None; for the overview only its line of help."""
+        """The command of that name, or None."""
         if cmd_name not in COMMANDS:
             return None
-        if _only_help():
-            return typer.core.TyperCommand(name=cmd_name, help=COMMANDS[cmd_name])
         module = importlib.import_module(f"companion.cli.{cmd_name}")
         single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         single.command(name=cmd_name, help=COMMANDS[cmd_name] + "\n\n" + (module.__doc__ or ""), epilog=module.EXAMPLE)(
@@ -50,10 +57,6 @@ class LazyGroup(TyperGroup):
         command = typer.main.get_command(single)
         command.name = cmd_name
         return command
-
-
-def _only_help() -> bool:
-    return len(sys.argv) < 2 or sys.argv[1] in {"--help", "-h"}
 
 
 def _show_version(wanted: bool) -> None:
@@ -95,10 +98,18 @@ def _interruptible(run: Callable[..., Any]) -> Callable[..., Any]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command line and returns its exit code (companion.errors.ExitCode)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        typer.main.get_command(app).main(args=arguments, prog_name="companion")
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(ExitCode.DONE)
+        code = typer.main.get_command(app).main(
+            args=arguments or ["--help"], prog_name="companion", standalone_mode=False
+        )
+        return code if isinstance(code, int) else int(ExitCode.DONE)
+    except USAGE_ERROR as error:
+        where = error.ctx.command_path if error.ctx else "companion"
+        print(f"{where}: {_one_line(error.format_message())}; try '{where} --help'", file=sys.stderr)
+        return int(ExitCode.BAD_INPUT)
+    except typer.Abort:
+        return int(ExitCode.INTERRUPTED)
     except CompanionError as error:
         print(f"companion: {error}", file=sys.stderr)
         return int(error.exit_code)
@@ -106,7 +117,10 @@ def main(arguments: list[str] | None = None) -> int:
         traceback.print_exc()
         print("companion: this is a fault of the program; please report it with the lines above", file=sys.stderr)
         return int(ExitCode.INTERNAL)
-    return int(ExitCode.DONE)
+
+
+def _one_line(message: str) -> str:
+    return " ".join(message.split()).rstrip(".")
 
 
 def entry() -> None:

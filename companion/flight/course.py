@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
 from companion.config import Vehicle
 from companion.control.types import GRAVITY_M_S2, Reference, Vec3
+from companion.errors import RefusedError
 from companion.trajectory.anchored import Anchored, Trajectory, anchored
-from companion.trajectory.flatness import PointMass, ReferenceLimits
+from companion.trajectory.flatness import PointMass, ReferenceLimits, demand
 from companion.trajectory.joins import Join, join, stop
 from companion.trajectory.pieces import Piece, chain
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
+GENTLE_ACCELERATION_M_S2 = 2.0
+GENTLE_RATE_RAD_S = 1.0
+"""Joins and stops are on the way to and from the flight's task: they need not use what the vehicle can do."""
 
 
 def reference_limits(vehicle: Vehicle) -> ReferenceLimits:
@@ -25,6 +33,26 @@ def reference_limits(vehicle: Vehicle) -> ReferenceLimits:
         rate_max_rad_s=min(lim.rate_max_rad_s[:2]),
         heading_rate_max_rad_s=heading_rate,
     )
+
+
+def gentle(limits: ReferenceLimits, end: Reference, model: PointMass) -> ReferenceLimits:
+    """The limits of a join or stop; what its moving end itself asks for is allowed, and half as much again."""
+    rate = demand(end, model).rate_rad_s
+    return replace(
+        limits,
+        acceleration_max_m_s2=min(
+            limits.acceleration_max_m_s2, max(GENTLE_ACCELERATION_M_S2, 1.5 * math.hypot(*end.a))
+        ),
+        rate_max_rad_s=min(limits.rate_max_rad_s, max(GENTLE_RATE_RAD_S, 1.5 * rate)),
+    )
+
+
+def _gently(plan: Callable[[ReferenceLimits], Join], limits: ReferenceLimits, easy: ReferenceLimits) -> Join:
+    """The plan within the easy limits, or within the vehicle's own where those do not do."""
+    try:
+        return plan(easy)
+    except RefusedError:
+        return plan(limits)
 
 
 def point_mass(vehicle: Vehicle) -> PointMass:
@@ -59,10 +87,13 @@ class Course:
         pieces: list[Piece] = []
         self.join_s = 0.0
         if trajectory.join == "smooth":
-            joined: Join = join(at_rest(hold_point, yaw_rad), path.at(0.0), limits, model)
+            begin = path.at(0.0)
+            rest = at_rest(hold_point, yaw_rad)
+            joined = _gently(lambda use: join(rest, begin, use, model), limits, gentle(limits, begin, model))
             pieces.append(joined)
             self.join_s = joined.duration_s
-        stopping = stop(path.at(path.duration_s), limits, model)
+        end = path.at(path.duration_s)
+        stopping = _gently(lambda use: stop(end, use, model), limits, gentle(limits, end, model))
         self.path = path
         self.track_s = path.duration_s
         self.stop_s = stopping.duration_s

@@ -19,17 +19,17 @@ from companion.link.wire import Wire
 
 INTERVAL_NS = 100_000_000
 TIMEOUT_NS = 3_000_000_000
+"""Longer than COM_OF_LOSS_T: afterwards the autopilot's own failsafe has acted."""
 WAIT_S = 0.02
 _ACCEPTED = 0
 
 
-def ask_for_hold(wire: Wire, system: int, timeout_ns: int = TIMEOUT_NS) -> bool:
+def ask_for_hold(wire: Wire, system: int) -> bool:
     """Asks for Hold every 100 ms of wall time until it is acknowledged or seen, another mode is, or time is up.
 
     Args:
         wire: the link.
         system: the autopilot's system id.
-        timeout_ns: how long to go on [ns].
 
     Returns:
         Whether the autopilot has taken Hold.
@@ -39,7 +39,7 @@ def ask_for_hold(wire: Wire, system: int, timeout_ns: int = TIMEOUT_NS) -> bool:
     params = (1.0, float(modes.HOLD.main), float(modes.HOLD.sub), 0.0, 0.0, 0.0, 0.0)
     asked = 0
     try:
-        while (wall_ns := time.monotonic_ns()) - begun_ns < timeout_ns:
+        while (wall_ns := time.monotonic_ns()) - begun_ns < TIMEOUT_NS:
             if wall_ns - asked_ns >= INTERVAL_NS:
                 asked_ns = wall_ns
                 payload = codec.encode_command_long(

@@ -180,6 +180,7 @@ class FlightLoop:
             return detail
         with contextlib.suppress(Exception):  # what failed may fail again; Hold is asked for all the same
             self._coast()
+            self._answer_requests()  # a vehicle in lockstep waits
         self._sequence.duty = Duty.NOTHING
         taken = ask_for_hold(self._wire, self._ops.target_system)
         how = "handed over to Hold" if taken else "Hold was not acknowledged, the autopilot's own failsafe acts"

@@ -363,7 +363,7 @@ class Sequence:
                 raise FlightEnded(cause, f"{detail}; {where}".lstrip("; "))
         elif mode is not None and mode not in self._modes_to_leave():
             self._give_up(f"the autopilot reports {mode.label} by another hand, nothing more is asked of it")
-        elif operation is not None and operation.accepted:
+        elif operation is not None and (operation.accepted or self._autopilot.intended == mode == modes.HOLD):
             self._confirmed_hold_s = now_s
             self.duty = Duty.NOTHING
         elif now_s - self._since_s > HANDOVER_TIMEOUT_S:
