@@ -23,6 +23,7 @@ from companion.errors import InputError
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Gain = Annotated[float, Field(ge=0.01, le=100.0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 PositiveVector = tuple[Positive, Positive, Positive]
 NotNegativeVector = tuple[NotNegative, NotNegative, NotNegative]
@@ -86,11 +87,11 @@ class Noise(Section):
 class Controller(Section):
     """[controller]: the gain set of docs/law.md."""
 
-    k1_1_s: Positive
-    k2: Positive
-    k3_1_s: Positive
-    k4_1_s: Positive
-    gamma_1_s3: NotNegative
+    k1_1_s: Gain
+    k2: Gain
+    k3_1_s: Gain
+    k4_1_s: Gain
+    gamma_1_s3: Annotated[float, Field(ge=0.0, le=1000.0, allow_inf_nan=False)]
     position_error_max_m: Positive
     heading: Literal["damping", "sideslip", "commanded"]
     heading_l1_1_s: Positive = 1.0
@@ -114,7 +115,7 @@ class FlightLimits(Section):
     heading_rate_max_rad_s: Positive
     speed_max_m_s: Positive
     acceleration_max_m_s2: Positive
-    state_gap_max_s: Positive = 0.2
+    state_gap_max_s: Positive = 0.1
     position_error_abort_m: Positive = 100.0
 
     @model_validator(mode="after")

@@ -1,6 +1,6 @@
 """The paper's own setting: perfect state, the law inside the integrator, torque realised exactly, no limits.
 
-The ODE is paper.md section 1 (vehicle) with section 3 (controller) in one state vector, integrated by scipy's DOP853.
+The ODE is that of docs/law.md, vehicle and controller in one state vector, integrated by scipy's DOP853.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from math import isfinite
 from typing import Annotated, Any
 
 import typer
@@ -22,17 +23,14 @@ def run(
         str | None, typer.Option("--start", metavar="N,E,D", help="Predict from here instead of the flight's [start].")
     ] = None,
     time_scale: TimeScaleOption = None,
-    allow_uncertified: Annotated[
-        bool, typer.Option("--allow-uncertified", help="Predict and exit with 0 although the gains fail.")
-    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Prints certificate, margins and predicted extremes of a configuration."""
     from companion.campaign.predict import Extreme, bounds, gate_prediction
-    from companion.control.certificate import certify
+    from companion.control.certificate import certify, disturbance_overcome
     from companion.control.sampled import margins
     from companion.errors import CompanionError, ExitCode
-    from companion.flight.preflight import gate_gains, timing
+    from companion.flight.preflight import gate_gains, gate_reference, timing
     from companion.flight.tracker import kernels
     from companion.trajectory.load import of_flight
 
@@ -50,6 +48,7 @@ def run(
             "qr_estimator_on": certificate.outside,
             "qr_estimator_off": certificate.outside_frozen,
         },
+        "disturbance_overcome_m_s2": disturbance_overcome(parameters.gains),
         "poles_1_s": [[pole.real, pole.imag] for pole in certificate.poles],
         "sampled_loop": {
             "interval_s": timing(vehicle).interval_s,
@@ -59,26 +58,31 @@ def run(
             "interval_max_s": found.interval_max_s,
         },
     }
-    refusal: str | None = None
+    refusals: list[str] = []
     try:
         gate_gains(vehicle)
-        if flight.trajectory:
-            path = of_flight(flight)
-            low, high = bounds(flight, path)
-            document["thrust_bounds_n"] = {"low": low, "high": high}
+    except CompanionError as error:
+        refusals.append(str(error))
+    if flight.trajectory:
+        path = of_flight(flight)
+        low, high = bounds(flight, path)
+        document["thrust_bounds_n"] = {"low": low, "high": high} if isfinite(low) else None
+        try:
+            gate_reference(path, vehicle)
             prediction = gate_prediction(flight, path, kernels("python"))
             document["predicted"] = {
                 name: value._asdict() if isinstance(value, Extreme) else value
                 for name, value in prediction._asdict().items()
             }
-    except CompanionError as error:
-        refusal = str(error)
+        except CompanionError as error:
+            refusals.append(str(error))
+    refusal = refusals[0] if refusals else None
     document["refused"] = refusal
     if as_json:
         print(json.dumps(document, indent=2))
     else:
         _print(document)
-    if refusal is not None and not allow_uncertified:
+    if refusal is not None:
         raise typer.Exit(int(ExitCode.REFUSED))
 
 
@@ -122,15 +126,20 @@ def _print(document: dict[str, Any]) -> None:
         say(f"  {name:34s} " + "  ".join(f"{x:8.4f}" for x in document["eigenvalues"][key]))
     poles = ", ".join(f"{re:.3f}{im:+.3f}i" if im else f"{re:.3f}" for re, im in document["poles_1_s"])
     say(f"poles of the linear loop [1/s]: {poles}")
+    overcome = document["disturbance_overcome_m_s2"]
+    say(f"disturbance held against with the estimator still: {overcome:.2f} m/s^2 (the limit must be below)")
     loop = document["sampled_loop"]
     say(f"sampled loop at {1.0 / loop['interval_s']:.0f} Hz with {loop['delay_s'] * 1e3:.0f} ms of delay")
     say(f"  {'largest |eigenvalue|':34s} {loop['spectral_radius']:.5f} (below 1)")
     say(f"  {'margin in delay':34s} {loop['delay_margin_s'] * 1e3:.1f} ms (at least 10 ms)")
     say(f"  {'longest tolerable interval':34s} {loop['interval_max_s'] * 1e3:.0f} ms")
     if "thrust_bounds_n" in document:
-        low, high = document["thrust_bounds_n"]["low"], document["thrust_bounds_n"]["high"]
-        silent = "; it says nothing here, the prediction decides" if low <= 0.0 else ""
-        say(f"thrust bounds (38): {low:.1f} to {high:.1f} N{silent}")
+        bound = document["thrust_bounds_n"]
+        if bound is None:
+            say("thrust bounds (38): none, the estimator is off")
+        else:
+            silent = "; it says nothing here, the prediction decides" if bound["low"] <= 0.0 else ""
+            say(f"thrust bounds (38): {bound['low']:.1f} to {bound['high']:.1f} N{silent}")
     if "predicted" in document:
         say("predicted for this trajectory and start (nominal loop, first seconds)")
         names = {

@@ -1,4 +1,4 @@
-"""The certificate of a gain set (paper.md section 4): what can be said before the flight, without simulating it.
+"""The certificate of a gain set (docs/law.md section 4): what can be said before the flight, without simulating it.
 
 Inside |e1| <= p_max the closed loop is linear on every axis; V' = -e' Q e and, for all of space, V_H' <= -z' Qr z. Q >
 0 and Qr > 0 certify global asymptotic stability while the thrust stays positive. Where the estimator is projected or
@@ -47,7 +47,7 @@ def outside_matrix(gains: Gains, drag: float, *, estimator: bool = True) -> Floa
 
 
 def linear_loop(gains: Gains, drag: float) -> FloatArray:
-    """A of (e1, e2, e3, e4, b_tilde)' = A (...) on one axis, inside (paper.md section 3). Shape (5, 5)."""
+    """A of (e1, e2, e3, e4, b_tilde)' = A (...) on one axis, inside (docs/law.md section 3). Shape (5, 5)."""
     k1, k2, k3 = gains.k1, gains.k2, gains.k3
     c0 = 1.0 / (k1 * k1 * k2)
     kk, ks = k1 * k2, k1 * k2 + k3
@@ -89,7 +89,7 @@ class Certificate(NamedTuple):
             ("Qr (outside p_max, estimator on)", self.outside),
             ("Qr (outside p_max, estimator off)", self.outside_frozen),
         ):
-            if values[0] <= 0.0:
+            if not values[0] > 0.0:
                 return f"the smallest eigenvalue of {name} is {values[0]:.4g}, it must be above 0"
         return None
 
@@ -109,8 +109,21 @@ def certify(gains: Gains, drag: float) -> Certificate:
     )
 
 
+def disturbance_overcome(gains: Gains) -> float:
+    """The largest |b/m - b_hat| [m/s^2] that the bounded position error holds against while the estimator stands still.
+
+    With e1 far outside the errors settle where e2' = e3' = e4' = 0; beyond this value they do so only with |sigma| >
+    p_max, which does not exist: the vehicle drifts away. Inside the ball B of the estimate it must not come to that.
+    """
+    k1, k2, k3, k4 = gains.k1, gains.k2, gains.k3, gains.k4
+    return gains.p_max / (1.0 / (k1 * k1 * k2) + 1.0 / (k1 * (k1 * k2 + k3 + k4)))
+
+
 class ThrustBounds(NamedTuple):
-    """What (38), corrected, promises of the thrust along a whole flight [N]; conservative, often silent."""
+    """What (38), corrected, promises of the thrust along a whole flight [N]; conservative, often silent.
+
+    Infinite where it promises nothing, as with the estimator switched off.
+    """
 
     low_n: float
     high_n: float
@@ -137,8 +150,8 @@ def thrust_bounds(
         b_hat_start: |b_hat(0)| [m/s^2].
     """
     k1, k2 = gains.k1, gains.k2
-    v = lyapunov_start
-    if gains.gamma > 0.0:
-        v += (disturbance_max + b_hat_start) ** 2 / (2.0 * k1 * gains.gamma)
+    if gains.gamma == 0.0:  # a disturbance that nobody estimates is not in V: only without one would a bound hold
+        return ThrustBounds(-math.inf, math.inf)
+    v = lyapunov_start + (disturbance_max + b_hat_start) ** 2 / (2.0 * k1 * gains.gamma)
     swing = q2_max + disturbance_max + math.sqrt((2.0 * k1 * gains.gamma + 4.0 * k1**4 * k2**2) * v)
     return ThrustBounds(mass * (gravity - swing), mass * (gravity + swing))

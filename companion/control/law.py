@@ -212,7 +212,7 @@ def estimator_rate(e: Errors, b_hat: Vec3, gamma: float, bound: float) -> Vec3:
 
 
 def error_rates(e: Errors, e1_rate: Vec3, b_hat_rate: Vec3, gains: Gains, drag: float) -> tuple[Vec3, Vec3, Vec3]:
-    """e2', e3', e4' of the closed loop (paper.md section 3 in one line each), with b_tilde taken as zero.
+    """e2', e3', e4' of the closed loop (docs/law.md section 3 in one line each), with b_tilde taken as zero.
 
     Args:
         e: the errors [m].
@@ -316,6 +316,8 @@ def evaluate(
     b_hat_acceleration = (0.0, 0.0, 0.0)
     if not frozen and gains.gamma > 0.0:
         b_hat_rate = estimator_rate(e, controller.b_hat, gains.gamma, limits.disturbance_max)
+    # b_hat'' is needed by the heading only, and is left out while the projection bends b_hat'
+    if not frozen and gains.gamma > 0.0 and b_hat_rate[0] == gains.gamma * (e.e2[0] + e.e3[0] + e.e4[0]):
         e1_rate = (state.v[0] - ref.v[0], state.v[1] - ref.v[1], state.v[2] - ref.v[2])
         e2r, e3r, e4r = error_rates(e, e1_rate, b_hat_rate, gains, model.drag)
         b_hat_acceleration = (
@@ -358,7 +360,7 @@ def evaluate(
 
 
 def rate_setpoint(w: float, tau: float, lag_s: float, dt_s: float) -> float:
-    """Setpoint that, held over dt, takes a first-order rate loop from w to w + tau dt (paper.md section 8)."""
+    """Setpoint that, held over dt, takes a first-order rate loop from w to w + tau dt (docs/law.md section 8)."""
     if lag_s <= 0.0:
         return w + tau * dt_s
     return w - tau * dt_s / math.expm1(-dt_s / lag_s)
@@ -438,7 +440,13 @@ def step(
     )
     # the same inversion for the rotors' lag: the setpoint that brings the thrust to T at the end of the interval
     ahead = rate_setpoint(controller.thrust, (thrust - controller.thrust) / dt_s, model.thrust_lag, dt_s)
-    command = Command(min(max(ahead, limits.thrust_min), limits.thrust_max), rates, (x, y, z), tau, flags)
+    if ahead > limits.thrust_max:
+        ahead = limits.thrust_max
+        flags |= LIMIT_THRUST_MAX
+    elif ahead < limits.thrust_min:
+        ahead = limits.thrust_min
+        flags |= LIMIT_THRUST_MIN
+    command = Command(ahead, rates, (x, y, z), tau, flags)
     return command, ControllerState(thrust, thrust_rate, b_hat, out.heading, lead), out
 
 
@@ -454,7 +462,7 @@ def start(thrust: float, q: Quat, mass: float, gravity: float, bound: float) -> 
 
 
 def lyapunov(e: Errors, p_max: float) -> float:
-    """V_H of paper.md section 4 without its b_tilde term, which nobody can measure [m^2]."""
+    """V_H of docs/law.md section 4 without its b_tilde term, which nobody can measure [m^2]."""
     size = norm(e.e1)
     potential = 0.5 * size * size if size <= p_max else p_max * size - 0.5 * p_max * p_max
     return potential + 0.5 * (dot(e.e2, e.e2) + dot(e.e3, e.e3) + dot(e.e4, e.e4))

@@ -1,7 +1,7 @@
 """What the law's own model of the vehicle does with a command over a short time: the piece that the prediction is made
 of.
 
-First-order body rates and thrust behind their setpoints, the rigid body of paper.md section 1 with drag and the
+First-order body rates and thrust behind their setpoints, the rigid body of docs/law.md section 1 with drag and the
 estimated disturbance. A kernel; `companion.flight.prediction` strings the pieces together, and the certificate
 linearises the very same function.
 """

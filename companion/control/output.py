@@ -9,6 +9,11 @@ from companion.control.law import torque
 from companion.control.types import Quat, Vec3
 from companion.control.vectors import clip, quat_exp, quat_multiply, quat_normalise
 
+LEAD_FILTER_S = 0.015
+"""Time constant of the filter on the lead of actuator controls: less would pass the state's noise to the rotors."""
+STEEPEST = 0.3
+"""Cosine of the tilt beyond which the yaw feed-forward grows no more."""
+
 
 class RateSetpoint(NamedTuple):
     """Body rates and thrust: SET_ATTITUDE_TARGET with mask 128."""
@@ -78,7 +83,8 @@ def attitude_output(
 ) -> AttitudeSetpoint:
     """R_cmd = R Exp(w_cmd / P_att): the attitude loop then asks its rate loop for w_cmd.
 
-    The yaw rate goes along as feed-forward about the world's z axis (px4.md 1.1), so the attitude carries no yaw error.
+    The yaw rate goes along as feed-forward, so the attitude carries no yaw error. PX4 turns by it about the world's z
+    axis: of a tilted vehicle that is roll and pitch too, which the attitude takes back.
     An autopilot that filters the setpoint with lag T gets it ahead by T times its own rate of change, w + tau / P_att.
 
     Args:
@@ -90,13 +96,39 @@ def attitude_output(
         conversion: the vehicle's normalisation.
     """
     gain, lag = conversion.attitude_gain, conversion.attitude_lag
+    a, b, c, d = q
+    down = (2.0 * (b * d - a * c), 2.0 * (c * d + a * b), 1.0 - 2.0 * (b * b + c * c))  # the world's z axis in the body
+    turn = rates[2] / max(down[2], STEEPEST)
     lead = (
-        (rates[0] + lag * tau[0]) / gain[0] + lag * w[0],
-        (rates[1] + lag * tau[1]) / gain[1] + lag * w[1],
+        (rates[0] - down[0] * turn + lag * tau[0]) / gain[0] + lag * w[0],
+        (rates[1] - down[1] * turn + lag * tau[1]) / gain[1] + lag * w[1],
         lag * w[2],
     )
     thrust = thrust_fraction(thrust_n, conversion.thrust_full_n, conversion.curve_factor)
-    return AttitudeSetpoint(thrust, quat_normalise(quat_multiply(q, quat_exp(lead))), rates[2])
+    return AttitudeSetpoint(thrust, quat_normalise(quat_multiply(q, quat_exp(lead))), turn)
+
+
+def lead(tau: Vec3, slow: Vec3, lag_s: float, dt_s: float) -> tuple[Vec3, Vec3]:
+    """The torque's lag behind the controls, made up for: (1 + lag s)/(1 + filter s) of tau, filtered against noise.
+
+    Args:
+        tau: angular acceleration wanted [rad/s^2].
+        slow: the filter's state, tau through 1/(1 + LEAD_FILTER_S s).
+        lag_s: of the rotors [s]; no longer than the filter: nothing is made up for.
+        dt_s: since the last call [s].
+
+    Returns:
+        the angular acceleration to command, and the filter's next state.
+    """
+    k = 1.0 - math.exp(-dt_s / LEAD_FILTER_S)
+    slow = (slow[0] + k * (tau[0] - slow[0]), slow[1] + k * (tau[1] - slow[1]), slow[2] + k * (tau[2] - slow[2]))
+    ratio = max(lag_s / LEAD_FILTER_S, 1.0)
+    ahead = (
+        slow[0] + ratio * (tau[0] - slow[0]),
+        slow[1] + ratio * (tau[1] - slow[1]),
+        slow[2] + ratio * (tau[2] - slow[2]),
+    )
+    return ahead, slow
 
 
 def actuator_output(thrust_n: float, tau: Vec3, w: Vec3, conversion: Conversion) -> ActuatorSetpoint:

@@ -1,4 +1,4 @@
-"""The commands between a state's stamp and the time at which the next command takes effect (paper.md section 8,
+"""The commands between a state's stamp and the time at which the next command takes effect (docs/law.md section 8,
 "Delay").
 
 A command computed from a state stamped s acts from s + delay until the next one does. So between a stamp and its time
@@ -49,7 +49,8 @@ class Prediction:
         self._thrust_lag_s = thrust_lag_s
         self._delay_s = delay_s
         self._at_s: float | None = None
-        self._acting: deque[Acting] = deque()
+        # until the first command acts, what holds the hover does
+        self._acting: deque[Acting] = deque([Acting(-math.inf, thrust_n, (0.0, 0.0, 0.0))])
         self._count = math.ceil(delay_s / PIECE_MAX_S - 1e-9)
         self.length_s = delay_s / self._count if self._count else 0.0
         """Length of the pieces [s]; 0 without a delay."""

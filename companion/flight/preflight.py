@@ -8,7 +8,7 @@ needs, and measures the state rate.
 from __future__ import annotations
 
 from companion.config import Flight, Vehicle
-from companion.control.certificate import certify
+from companion.control.certificate import certify, disturbance_overcome
 from companion.control.sampled import Margins, Timing, margins
 from companion.errors import RefusedError
 from companion.flight.course import point_mass, reference_limits
@@ -65,7 +65,21 @@ def gate_gains(vehicle: Vehicle, *, allow_uncertified: bool = False) -> Margins:
     hint = "change [controller], see `companion certify`"
     if failure and not allow_uncertified:
         raise RefusedError(f"the gains of vehicle {vehicle.name!r} are not certified: {failure}; {hint}")
+    overcome = disturbance_overcome(parameters.gains)
+    ball = vehicle.limits.disturbance_max_m_s2
+    if ball > overcome and not allow_uncertified:
+        raise RefusedError(
+            f"vehicle {vehicle.name!r}: limits.disturbance_max_m_s2 {ball:g} is more than the {overcome:.2f} m/s^2 that"
+            " the bounded position error holds against while the estimator stands still; raise"
+            " controller.position_error_max_m or lower the limit"
+        )
     found = margins(parameters, timing(vehicle))
+    gap = vehicle.limits.state_gap_max_s
+    if gap > found.interval_max_s > 0.0 and not allow_uncertified:
+        raise RefusedError(
+            f"vehicle {vehicle.name!r}: limits.state_gap_max_s {gap * 1e3:g} ms is longer than the"
+            f" {found.interval_max_s * 1e3:.0f} ms that the sampled loop bears; lower it"
+        )
     if found.delay_margin_s < DELAY_MARGIN_MIN_S and not allow_uncertified:
         raise RefusedError(
             f"the gains of vehicle {vehicle.name!r} leave a delay margin of {found.delay_margin_s * 1e3:.1f} ms,"
@@ -97,19 +111,14 @@ class Preflight:
         self._begun_s: float | None = None
         self._pending: list[Operation] = []
         self._reads: dict[str, Operation] = {}
-        self._first_us: int | None = None
-        self._last_us: int | None = None
+        self._first_s: float | None = None
         self._states = 0
         self._measuring_from_s: float | None = None
 
     def on_state(self, state: VehicleState) -> None:
         """Counts states once the rates have been asked for."""
-        if self._measuring_from_s is None:
-            return
-        if self._first_us is None:
-            self._first_us = state.t_vehicle_us
-        self._last_us = state.t_vehicle_us
-        self._states += 1
+        if self._measuring_from_s is not None:
+            self._states += 1
 
     def done(self, now_s: float) -> bool:
         """Goes on asking; True when everything is known and fine.
@@ -128,16 +137,18 @@ class Preflight:
         if self._measuring_from_s is None:
             self._measuring_from_s = now_s
             self._gate_answers()
-        if now_s - self._measuring_from_s < MEASURE_S:
+        if self._first_s is None:
+            if self._states > 0:
+                self._first_s, self._states = now_s, 0
+            elif now_s - self._measuring_from_s > FIRST_STATE_TIMEOUT_S:
+                raise FlightEnded(
+                    Cause.REFUSED,
+                    "no usable ODOMETRY within 5 s: the estimator is not ready, or the link does not carry it",
+                )
             return False
-        if self._states == 0:
-            if now_s - self._measuring_from_s < FIRST_STATE_TIMEOUT_S:
-                return False
-            raise FlightEnded(
-                Cause.REFUSED,
-                "no usable ODOMETRY within 5 s: the estimator is not ready, or the link does not carry it",
-            )
-        self._gate_rate()
+        if now_s - self._first_s < MEASURE_S:
+            return False
+        self._gate_rate(self._states / (now_s - self._first_s))
         return True
 
     def takeoff_amsl_m(self, state: VehicleState | None) -> float | None:
@@ -197,11 +208,8 @@ class Preflight:
                 " (Return)",
             )
 
-    def _gate_rate(self) -> None:
-        assert self._first_us is not None and self._last_us is not None
+    def _gate_rate(self, rate: float) -> None:
         wanted = self._flight.vehicle.link.state_rate_hz
-        span = max(self._last_us - self._first_us, 1)
-        rate = (self._states - 1) * 1e6 / span
         floor = RATE_FLOOR * wanted
         if rate < floor:
             raise FlightEnded(

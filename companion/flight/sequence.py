@@ -39,6 +39,8 @@ CONFIRM_TIMEOUT_S = 2.5
 START_SPEED_MAX_M_S = 1.0
 """Faster, the vehicle does not hold, and there is no hold point to begin from."""
 START_TIMEOUT_S = 30.0
+FRESH_S = 0.5
+"""An older state does not say where the vehicle is."""
 REASON_WAIT_S = 0.5
 """The autopilot's words about a refusal may come after its answer."""
 
@@ -90,6 +92,7 @@ class Sequence:
         self._notify = notify
         self._preflight = Preflight(flight, operations, autopilot)
         self._state: VehicleState | None = None
+        self._state_s = 0.0
         self._since_s = 0.0
         self._step_s = 0.0
         self._operation: Operation | None = None
@@ -119,7 +122,7 @@ class Sequence:
 
     def on_state(self, state: VehicleState, now_s: float) -> None:
         """A fresh state; called before the setpoint for it is computed."""
-        self._state = state
+        self._state, self._state_s = state, now_s
         if self.phase is Phase.PREFLIGHT:
             self._preflight.on_state(state)
         if self.ending is None and self.duty is Duty.TRACK:
@@ -209,7 +212,7 @@ class Sequence:
         steady = (
             self._autopilot.mode == modes.HOLD
             and self._autopilot.landed is LandedState.IN_AIR
-            and self._slower_than(SETTLED_SPEED_M_S)
+            and self._slower_than(SETTLED_SPEED_M_S, now_s)
         )
         if not steady:
             self._settled_since_s = None
@@ -228,8 +231,10 @@ class Sequence:
             self.end(Cause.REFUSED, operation.sentence, now_s)
         return True
 
-    def _slower_than(self, speed_m_s: float) -> bool:
-        return self._state is not None and max(abs(x) for x in self._state.v) < speed_m_s
+    def _slower_than(self, speed_m_s: float, now_s: float) -> bool:
+        state = self._state
+        fresh = state is not None and now_s - self._state_s < FRESH_S
+        return fresh and state is not None and max(abs(x) for x in state.v) < speed_m_s
 
     def _hold_first(self, now_s: float) -> None:
         """The vehicle must hold, and be meant to, before a setpoint is sent: PX4 goes back to OFFBOARD by itself at the
@@ -237,7 +242,7 @@ class Sequence:
         autopilot = self._autopilot
         if autopilot.mode == modes.HOLD and autopilot.intended in {None, modes.HOLD}:
             known = autopilot.intended is not None or self._operation is not None
-            if known and self._slower_than(START_SPEED_MAX_M_S):
+            if known and self._slower_than(START_SPEED_MAX_M_S, now_s):
                 self._plan_course(now_s)
                 return
         if self._operation is None and (autopilot.mode, autopilot.intended) != (modes.HOLD, modes.HOLD):

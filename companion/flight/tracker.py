@@ -17,7 +17,7 @@ from companion.control import flat
 from companion.control.heading import HeadingState
 from companion.control.law import ControllerState, Parameters, start, step
 from companion.control.model import Factors, advance, factors
-from companion.control.output import Conversion, Setpoint, actuator_output, attitude_output, rates_output
+from companion.control.output import Conversion, Setpoint, actuator_output, attitude_output, lead, rates_output
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.control.vectors import axes
 from companion.flight.prediction import Piece, Prediction
@@ -220,6 +220,7 @@ class Tracker:
         self._interval_s = 1.0 / vehicle.link.state_rate_hz
         self._gap_max_s = vehicle.limits.state_gap_max_s
         self._last_s: float | None = None
+        self._slow_tau: Vec3 = ZERO
         self.delay_s = vehicle.delay_s if vehicle.controller.prediction else 0.0
         self._prediction = self._new_prediction(0.0)
         length = self._prediction.length_s or self._interval_s
@@ -233,17 +234,20 @@ class Tracker:
 
         Args:
             state: the vehicle now.
-            thrust_n: the thrust that acts [N]; the weight when unknown.
+            thrust_n: the thrust that acts [N]; when unknown, the one that carries the weight.
         """
         model, limits = self.parameters.model, self.parameters.limits
-        thrust = model.mass * GRAVITY_M_S2 if thrust_n is None else thrust_n
+        r1, r2, r3 = axes(state.q)
+        thrust = thrust_n
+        if thrust is None:  # what carries the weight at this tilt
+            thrust = model.mass * GRAVITY_M_S2 / max(r3[2], 0.5)
         thrust = min(max(thrust, limits.thrust_min), limits.thrust_max)
         b_hat: Vec3 = ZERO
         if self.vehicle.controller.disturbance_start == "hover":
             _, b_hat = start(thrust, state.q, model.mass, model.gravity, limits.disturbance_max)
-        r1, r2, _ = axes(state.q)
         self._engine.begin(ControllerState(thrust, 0.0, b_hat, HeadingState(r2, r1, False), ZERO))
         self._prediction = self._new_prediction(thrust)
+        self._slow_tau = ZERO
         self._last_s = None
 
     def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
@@ -259,7 +263,7 @@ class Tracker:
         integrate = True
         if self._last_s is not None:
             dt = stamp_s - self._last_s
-            if dt > self._gap_max_s:  # too long to integrate over: the controller's state waits
+            if not 0.0 < dt <= self._gap_max_s:  # too long to integrate over: the controller's state waits
                 dt, integrate = self._interval_s, False
         self._last_s = stamp_s
         prediction = self._prediction
@@ -267,13 +271,14 @@ class Tracker:
         reference = reference_at(stamp_s + self.delay_s)
         numbers = self._engine.step(state, reference, prediction.thrust, pieces, frozen or not integrate, integrate, dt)
         prediction.sent(stamp_s, numbers[flat.THRUST], numbers[flat.RATES_MODEL])
-        return TrackerStep(self._convert(numbers), numbers)
+        return TrackerStep(self._convert(numbers, dt), numbers)
 
-    def _convert(self, n: Numbers) -> Setpoint:
+    def _convert(self, n: Numbers, dt_s: float) -> Setpoint:
         rates = (n[1], n[2], n[3])
         if self._output == "rates":
             return rates_output(n[flat.THRUST], rates, self._conversion)
         tau, w = (n[7], n[8], n[9]), (n[34], n[35], n[36])
-        if self._output == "attitude":
-            return attitude_output(n[flat.THRUST], rates, tau, (n[30], n[31], n[32], n[33]), w, self._conversion)
-        return actuator_output(n[flat.THRUST], tau, w, self._conversion)
+        if self._output == "actuators":
+            ahead, self._slow_tau = lead(tau, self._slow_tau, self.vehicle.rotors.lag_s, dt_s)
+            return actuator_output(n[flat.THRUST], ahead, w, self._conversion)
+        return attitude_output(n[flat.THRUST], rates, tau, (n[30], n[31], n[32], n[33]), w, self._conversion)

@@ -1,6 +1,6 @@
 """What a reference asks of the vehicle, by differential flatness with drag, and how much of the limits that uses.
 
-From v' = g u3 - (T/m) r3 - D v (paper.md section 1, disturbance left out) the reference fixes the thrust vector; its
+From v' = g u3 - (T/m) r3 - D v (docs/law.md section 1, disturbance left out) the reference fixes the thrust vector; its
 direction's derivatives fix the roll and pitch parts of body rate and angular acceleration. Rotation about the thrust
 axis (heading) is free.
 """

@@ -1,14 +1,17 @@
-"""The certificate against paper.md section 4, and the sampled loop against the flight that it speaks of."""
+"""The certificate against docs/law.md section 4, and the sampled loop against the flight that it speaks of."""
 
 import numpy as np
 import pytest
-from law_cases import MASS, NO_LIMITS, PAPER_GAINS, ZERO, parameters
+from law_cases import MASS, NO_LIMITS, PAPER_GAINS, ZERO, memory, parameters
 
+from companion.campaign.ideal import World, fly
 from companion.config import load_flight, load_vehicle
-from companion.control.certificate import certify, inside_matrix, linear_loop, thrust_bounds
-from companion.control.law import Model, Parameters
+from companion.control.certificate import certify, disturbance_overcome, inside_matrix, linear_loop, thrust_bounds
+from companion.control.law import ControllerState, Model, Parameters
 from companion.control.sampled import Timing, loop_matrix, margins, spectral_radius
+from companion.control.types import State
 from companion.errors import RefusedError
+from companion.flight.course import at_rest
 from companion.flight.preflight import gate_gains
 
 
@@ -50,8 +53,21 @@ def test_thrust_bounds_are_symmetric_about_the_weight_and_grow_with_the_start():
     far = thrust_bounds(PAPER_GAINS, MASS, 9.81, 0.3, 1.2, 10.0, 0.0)
     assert near.low_n + near.high_n == pytest.approx(2 * MASS * 9.81)
     assert far.low_n < near.low_n
-    still = thrust_bounds(PAPER_GAINS._replace(gamma=0.0), MASS, 9.81, 0.3, 1.2, 0.0, 0.0)
-    assert still.low_n == pytest.approx(MASS * (9.81 - 1.5))
+    nothing = thrust_bounds(PAPER_GAINS._replace(gamma=0.0), MASS, 9.81, 0.3, 1.2, 0.0, 0.0)
+    assert nothing == (-np.inf, np.inf)
+
+
+@pytest.mark.parametrize(("share", "drifts"), [(0.95, False), (1.05, True)])
+def test_without_the_estimator_only_so_much_disturbance_is_overcome(share, drifts):
+    gains = PAPER_GAINS._replace(gamma=0.0, p_max=1.0)
+    force = share * disturbance_overcome(gains)
+    start = State((0.0, 0.0, -10.0), ZERO, (1.0, 0.0, 0.0, 0.0), ZERO)
+    hover = at_rest((0.0, 0.0, -10.0), 0.0)
+    ctrl = ControllerState(MASS * 9.81, 0.0, ZERO, memory(), ZERO)
+    world = World((force * MASS, 0.0, 0.0), 9.81, 0.0)
+    flight = fly(lambda t: hover, start, ctrl, parameters(gains), world, np.array([0.0, 30.0, 60.0]))
+    speed = abs(flight[-1].state.v[0])
+    assert (speed > 0.01) == drifts
 
 
 def test_fast_sampling_without_lags_gives_the_poles_of_the_continuous_loop():

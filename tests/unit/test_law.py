@@ -1,4 +1,4 @@
-"""The law against paper.md's closed forms: the linear loop, V' and V_H', the values of section 6, the sampled step."""
+"""The law against its closed forms: the linear loop, V' and V_H', the paper's flight, the sampled step."""
 
 import math
 

@@ -58,11 +58,11 @@ def test_pieces_cover_the_delay_with_the_commands_in_their_order(delay, interval
             expected = 0.0
             for k, (since, value) in enumerate(history):
                 end = history[k + 1][0] if k + 1 < len(history) else math.inf
-                begin = since if k else -math.inf  # the first command stands for what acted before it
+                begin = since
                 expected += value * max(0.0, min(end, stamp + delay) - max(begin, stamp))
             assert total == pytest.approx(expected, abs=1e-4 * delay + 1e-6 * 30)
-        else:
-            assert pieces == []
+        elif pieces:
+            assert all(p[0] == pytest.approx(10.0) and p[1] == (0.0, 0.0, 0.0) for p in pieces)  # the hover
         prediction.sent(stamp, 10.0 + i, (float(i), 0.0, 0.0))
         history.append((stamp + delay, float(i)))
         stamp += interval * factor

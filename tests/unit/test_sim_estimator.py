@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sim_cases import LEVEL, NOTHING, OFF, PAPER, noiseless
 
-from sim_link.estimator import Estimator, normal_numbers
+from sim_link.estimator import NOISE_ROWS, Estimator, NoiseBlocks, noise_block
 from sim_link.physics import RigidState
 from sim_link.rotation import exponential, logarithm, multiply
 from sim_link.vehicle_file import VehicleFile
@@ -65,6 +65,14 @@ def test_noise_does_not_depend_on_who_asks_when() -> None:
     assert often.believed() != other.believed()
 
 
-def test_normal_numbers_are_a_fixed_function() -> None:
-    assert normal_numbers(1, 2) == normal_numbers(1, 2)
-    assert len({normal_numbers(s, i) for s in range(-5, 5) for i in range(10)}) == 100
+def test_noise_blocks_are_a_fixed_function_of_seed_and_number() -> None:
+    assert np.array_equal(noise_block(1, 2), noise_block(1, 2))
+    assert len({noise_block(s, i).tobytes() for s in range(-5, 5) for i in range(10)}) == 100
+
+
+def test_noise_is_the_row_of_the_sample_whoever_asked_before() -> None:
+    blocks = NoiseBlocks(7)
+    for sample in (3 * NOISE_ROWS, 0, NOISE_ROWS - 1, NOISE_ROWS, 5):
+        blocks.move_to(sample)
+        expected = noise_block(7, sample // NOISE_ROWS)[sample % NOISE_ROWS]
+        assert np.array_equal(blocks.rows[sample - blocks.first], expected)

@@ -1,0 +1,265 @@
+"""The control loop with a vehicle that does not wait: no lockstep, no sockets, and a wall clock that the test turns.
+
+`VirtualWire` stands for the link. Waiting on it lets the clock go on; the simulated vehicle moves and sends when its
+time has come, as it would in real time, and a stall of the companion is a jump of the clock.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomlkit
+
+from companion.config import Flight, build_flight, find, read_toml
+from companion.flight.loop import FlightLoop
+from companion.flight.phases import PHASE_NAMES, Cause, Outcome
+from companion.flight.tracker import kernels
+from companion.link.codec import message_formats
+from companion.link.framing import Frame, FrameParser, LinkCounters, build_frame
+from companion.record.flight_record import FlightRecord
+from companion.trajectory.load import of_flight
+from sim_link import codec
+from sim_link.modes import Mode
+from sim_link.vehicle import Vehicle, VehicleOptions
+from sim_link.vehicle_file import load
+
+START_NS = 5_000_000_000
+STATE_PERIOD_NS = 10_000_000
+ODOMETRY, TIMESYNC = codec.ID_ODOMETRY, codec.ID_TIMESYNC
+
+
+class VirtualWire:
+    """The vehicle link as the loop sees it, with time of its own."""
+
+    component_id = 191
+    last_foreign = None
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.now_ns = START_NS
+        self.system_id = 1
+        self.peer = ("virtual", 1)
+        self.counters = LinkCounters()
+        self.sent: list[tuple[int, int, Any]] = []
+        """Vehicle time [us], message id, message."""
+        self.alter: Callable[[int, bytes], list[bytes]] = lambda msg_id, raw: [raw]
+        self.offboard_us: int | None = None
+        self.stall: tuple[float, float] | None = None
+        """When after OFFBOARD the companion is stopped, and for how long [s]."""
+        self.dead = False
+        self._parser = FrameParser(message_formats(), self.counters, None)
+        self._decoder = codec.Decoder()
+        self._next_ns = START_NS
+        self._waiting: list[bytes] = []
+
+    @property
+    def offboard_s(self) -> float:
+        return -math.inf if self.offboard_us is None else (self.vehicle.t_us - self.offboard_us) * 1e-6
+
+    def receive(self, timeout_s: float) -> list[Frame]:
+        if self.stall is not None and self.offboard_s >= self.stall[0]:
+            self._advance_to(self.now_ns + int(self.stall[1] * 1e9))
+            self.stall = None
+        elif not self._waiting:
+            end_ns = self.now_ns + int(timeout_s * 1e9)
+            self._advance_to(end_ns if self.dead else min(end_ns, max(self._next_ns, self.now_ns)))
+        frames: list[Frame] = []
+        for raw in self._waiting:
+            self._parser.parse(raw, self.now_ns, frames, [])
+        self._waiting.clear()
+        return frames
+
+    def _advance_to(self, wall_ns: int) -> None:
+        while self._next_ns <= wall_ns and not self.dead:
+            self.now_ns = max(self.now_ns, self._next_ns)
+            self._next_ns += STATE_PERIOD_NS
+            self.vehicle.tick()
+            if self.offboard_us is None and self.vehicle.autopilot.mode is Mode.OFFBOARD:
+                self.offboard_us = self.vehicle.t_us
+            for raw in self.vehicle.companion.outbox:
+                self._waiting += self.alter(raw[7] | raw[8] << 8 | raw[9] << 16, raw)
+            self.vehicle.companion.outbox.clear()
+        self.now_ns = max(self.now_ns, wall_ns)
+
+    def send(self, msgid: int, payload: bytes) -> bool:
+        formats = message_formats()
+        raw = build_frame(msgid, payload, 0, self.system_id, self.component_id, formats[msgid].crc_extra, None)
+        for frame in codec.frames(raw):
+            message = self._decoder.message(frame)
+            self.sent.append((self.vehicle.t_us, msgid, message))
+            if not self.dead:
+                self.vehicle.receive(frame, self.vehicle.companion)
+        return True
+
+    def release_peer(self) -> None:
+        """There is only one."""
+
+    def setpoints(self, from_s: float = 0.0) -> list[tuple[float, Any]]:
+        return self._of(codec.ID_SET_ATTITUDE_TARGET, from_s)
+
+    def holds(self, from_s: float = 0.0) -> list[float]:
+        commands = self._of(codec.ID_COMMAND_LONG, from_s)
+        return [t for t, m in commands if m.command == 176 and (m.param2, m.param3) == (4.0, 3.0)]
+
+    def _of(self, msg_id: int, from_s: float) -> list[tuple[float, Any]]:
+        begun = math.inf if self.offboard_us is None else self.offboard_us
+        found = [((t - begun) * 1e-6, m) for t, number, m in self.sent if number == msg_id]
+        return [(t, m) for t, m in found if t >= from_s]
+
+
+def plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+@pytest.fixture
+def flight() -> Flight:
+    vehicle = read_toml(find("paper", "vehicles"))
+    vehicle["link"]["state_rate_hz"] = 100.0
+    hover = {"name": "hover", "shape": "hover", "duration_s": 1.0, "hover": {"point_m": [0.0, 0.0, 0.0]}}
+    return build_flight({"name": "test", "vehicle": vehicle, "trajectory": hover}, "test")
+
+
+@pytest.fixture
+def make_wire(
+    flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[tuple[Any, float] | None], VirtualWire]:
+    path = tmp_path / "vehicle.toml"
+    path.write_text(tomlkit.dumps(plain(flight.vehicle.model_dump(exclude_none=True))))
+
+    def make(start: tuple[Any, float] | None) -> VirtualWire:
+        wire = VirtualWire(Vehicle(VehicleOptions(vehicle=load(str(path)), start=start, engine="python")))
+        monkeypatch.setattr(time, "monotonic_ns", lambda: wire.now_ns)
+        return wire
+
+    return make
+
+
+@pytest.fixture
+def wire(make_wire: Callable[..., VirtualWire]) -> VirtualWire:
+    return make_wire(((0.0, 0.0, -20.0), 0.0))
+
+
+def fly(flight: Flight, wire: VirtualWire) -> tuple[Outcome, FlightRecord]:
+    record = FlightRecord(2000, PHASE_NAMES)
+    loop = FlightLoop(flight, of_flight(flight), wire, record, kernels("python"))  # type: ignore[arg-type]
+    return loop.run(), record
+
+
+def test_whole_flight(flight: Flight, wire: VirtualWire) -> None:
+    outcome, record = fly(flight, wire)
+    assert outcome.cause is Cause.COMPLETED, outcome.sentence
+    assert wire.vehicle.autopilot.mode is Mode.HOLD
+    assert outcome.phases[0].reason == "heard the autopilot (system 1)"  # not in lockstep
+    errors = record.columns("error_n", "error_e", "error_d")
+    assert abs(errors).max() < 0.1
+    # Every state is answered once, and PX4's 10 Hz of TIMESYNC requests give the states their age.
+    assert outcome.lost_setpoints == 0
+    stamps = [m.time_boot_ms for _, m in wire.setpoints(-math.inf)]
+    assert len(stamps) == len(set(stamps))
+    age = record.column("state_age_ms")
+    assert 15.0 < age.min() <= age.max() < 45.0  # 20 ms old, and up to a period of the grid
+
+
+def test_timesync_is_answered_after_the_setpoint(flight: Flight, wire: VirtualWire) -> None:
+    """A vehicle that waits for the answer then has the setpoint, whether it was recognised or not."""
+    fly(flight, wire)
+    kinds = [number for t, number, _ in wire.sent if wire.offboard_us and t >= wire.offboard_us + 200_000]
+    answers = [i for i, number in enumerate(kinds) if number == TIMESYNC and i > 0]
+    assert len(answers) > 10
+    assert all(codec.ID_SET_ATTITUDE_TARGET in kinds[i - 2 : i] for i in answers[:10])
+
+
+def test_short_stall_is_bridged_and_counted(flight: Flight, wire: VirtualWire) -> None:
+    """The newest of the states that gathered is answered, the others are accounted for."""
+    wire.stall = (0.8, 0.040)
+    outcome, record = fly(flight, wire)
+    assert outcome.cause is Cause.COMPLETED
+    assert record.column("skipped").max() == outcome.lost_setpoints == 3
+    assert abs(record.columns("error_n", "error_e", "error_d")).max() < 0.1
+
+
+def test_long_stall_ends_the_flight(flight: Flight, wire: VirtualWire) -> None:
+    """After half of COM_OF_LOSS_T without a setpoint none follows: PX4 would come back to OFFBOARD at any time."""
+    wire.stall = (0.8, 0.7)
+    outcome, _ = fly(flight, wire)
+    assert outcome.cause is Cause.OWN_SILENCE
+    assert wire.setpoints(0.82) == []
+    assert len(wire.holds(0.8)) >= 1
+    assert wire.vehicle.autopilot.mode is wire.vehicle.autopilot.intended is Mode.HOLD
+
+
+def test_states_that_cease(flight: Flight, wire: VirtualWire) -> None:
+    """The companion's own clock tells; nothing else needs to come from the vehicle."""
+    wire.alter = lambda msg_id, raw: [] if wire.offboard_s >= 0.8 and msg_id in {ODOMETRY, TIMESYNC} else [raw]
+    outcome, _ = fly(flight, wire)
+    assert outcome.cause is Cause.STATE_LOST
+    ((coast_s, coast),) = wire.setpoints(0.8)
+    assert coast_s == pytest.approx(0.85, abs=0.03)
+    assert (coast.body_roll_rate, coast.body_pitch_rate, coast.body_yaw_rate) == (0.0, 0.0, 0.0)
+    assert wire.holds(0.8)[0] == pytest.approx(coast_s, abs=0.001)
+    assert wire.vehicle.autopilot.mode is Mode.HOLD
+
+
+def test_vehicle_that_is_gone(flight: Flight, wire: VirtualWire) -> None:
+    """Nothing answers any more: the same, and an end after the hand-over has been tried for 3 s."""
+
+    def alter(msg_id: int, raw: bytes) -> list[bytes]:
+        wire.dead = wire.dead or wire.offboard_s >= 0.8
+        return [raw]
+
+    wire.alter = alter
+    outcome, _ = fly(flight, wire)
+    assert outcome.cause is Cause.STATE_LOST
+    assert "Hold was not acknowledged" in outcome.sentence
+    assert 25 <= len(wire.holds(0.8)) <= 32
+    assert len(wire.setpoints(0.8)) <= 2  # for the last state, and the coast setpoint
+
+
+def test_vehicle_that_is_gone_during_takeoff(flight: Flight, make_wire: Callable[..., VirtualWire]) -> None:
+    """Where no setpoints are due its silence ends the flight as well."""
+    wire = make_wire(None)
+
+    def alter(msg_id: int, raw: bytes) -> list[bytes]:
+        wire.dead = wire.dead or wire.vehicle.t_us > 4_000_000
+        return [raw]
+
+    wire.alter = alter
+    outcome, _ = fly(flight, wire)
+    assert [phase.name for phase in outcome.phases] == ["connect", "preflight", "takeoff"]
+    assert (outcome.cause, outcome.detail) == (Cause.LINK_LOST, "no message for 5 s")
+    assert wire.setpoints(-math.inf) == []
+
+
+def test_states_that_cease_during_the_checks(flight: Flight, wire: VirtualWire) -> None:
+    """What was measured must hold until the end of the measurement."""
+    wire.alter = lambda msg_id, raw: [] if wire.vehicle.t_us > 2_000_000 and msg_id == ODOMETRY else [raw]
+    outcome, _ = fly(flight, wire)
+    assert outcome.cause is Cause.REFUSED
+    assert "ODOMETRY comes at" in outcome.sentence
+    assert wire.setpoints(-math.inf) == []
+
+
+def test_rebooted_autopilot_is_asked_for_hold_on_the_wall_clock(flight: Flight, wire: VirtualWire) -> None:
+    """Its clock runs anew and far behind: what is timed must not wait for it."""
+
+    def alter(msg_id: int, raw: bytes) -> list[bytes]:
+        if wire.offboard_s < 0.8 or msg_id not in {ODOMETRY, TIMESYNC}:
+            return [raw]
+        if msg_id == TIMESYNC:
+            return []
+        payload = bytearray(codec.frames(raw)[0].payload)
+        payload[0:8] = (int.from_bytes(payload[0:8], "little") - 3_000_000).to_bytes(8, "little")
+        return [codec.Encoder(1, 1).hot(ODOMETRY, bytes(payload))]
+
+    wire.alter = alter
+    outcome, _ = fly(flight, wire)
+    assert outcome.cause is Cause.REBOOTED
+    assert wire.vehicle.autopilot.mode is Mode.HOLD
+    assert len(wire.setpoints(0.85)) <= 1

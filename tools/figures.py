@@ -1,0 +1,162 @@
+"""Measures the figures that the project promises, in one run, and prints them as a table.
+
+    python tools/figures.py [--quick] [--out FOLDER]
+
+Flights go over UDP in lockstep on the bundled vehicle. Speed is vehicle time over wall time between the first and the
+last state of a flight's traffic log. Step times are medians over calls of the control step as the loop makes them. The
+machine should be otherwise idle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from companion import accelerate
+from companion.config import load_flight
+from companion.control.types import State
+from companion.flight.course import Course
+from companion.flight.tracker import Tracker, kernels
+from companion.link import codec
+from companion.record.summary import without_wall_clock
+from companion.record.tlog import read_tlog
+from companion.trajectory.load import load
+
+
+def demo(folder: Path, *options: str) -> dict[str, Any]:
+    """Flies `companion demo` with these options and returns its summary."""
+    command = [sys.executable, "-m", "companion", "demo", "--json", "--out", str(folder), *options]
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, timeout=300, check=False
+    )
+    if not done.stdout:
+        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}")
+    summary: dict[str, Any] = json.loads(done.stdout)
+    return summary
+
+
+def speed(folder: Path) -> float:
+    """Vehicle time over wall time from the first to the last state in the traffic log."""
+    first: tuple[float, float] | None = None
+    last = (0.0, 0.0)
+    for logged in read_tlog(folder / "link.tlog"):
+        raw = logged.raw
+        if raw[0] == 0xFD and int.from_bytes(raw[7:10], "little") == codec.ODOMETRY:
+            t_vehicle_s = int.from_bytes(raw[10:18], "little") * 1e-6
+            last = (t_vehicle_s, logged.epoch_us * 1e-6)
+            first = first or last
+    assert first is not None
+    return (last[0] - first[0]) / (last[1] - first[1])
+
+
+def flights(base: Path, quick: bool) -> list[tuple[str, str, str]]:
+    """Accuracy: every row is a flight."""
+    cases: list[tuple[str, float, tuple[str, ...]]] = [
+        ("demo, state age 20 ms", 0.01, ()),
+        ("demo, state age 30 ms", 0.03, ("--state-age", "0.03")),
+        ("demo, state age 40 ms", 0.03, ("--state-age", "0.04")),
+        ("demo, attitude output", 0.05, ("--output", "attitude")),
+        ("demo, actuator output, PX4 1.13", 0.03, ("--output", "actuators", "--px4", "1.13")),
+        ("bundled vehicle (1 kg, D = 1 1/s), paper's path", 0.03, ("--flight", "eight")),
+        ("the same, 2.5 times as fast", 0.03, ("--flight", "eight", "--time-scale", "2.5")),
+    ]
+    rows = []
+    for i, (name, limit, options) in enumerate(cases[: 1 if quick else None]):
+        s = demo(base / f"flight-{i}", *options)
+        rms = s["position_rms_m"]
+        rows.append((f"{name}: position_rms_m", f"<= {limit:g}", "not settled" if rms is None else f"{rms:.4f}"))
+        if i == 0:
+            truth = (1.0, 0.0, 0.4905)
+            off = max(abs(a - b) for a, b in zip(s["disturbance_m_s2"], truth, strict=True)) / 1.114
+            rows.append(("  disturbance, off the truth by", "<= 3 %", f"{100 * off:.2f} %"))
+            rows.append(("  body v_y once settled, rms", "<= 0.05 m/s", f"{s['body_sideways_rms_m_s']:.4f} m/s"))
+    return rows
+
+
+def speeds(base: Path, repeats: int) -> list[tuple[str, str, str]]:
+    """Lockstep flights with either engine, in turn; and the same seed twice."""
+    engines = ["python", *(["numba"] if accelerate.available() else [])]
+    found: dict[str, list[float]] = {engine: [] for engine in engines}
+    summaries = []
+    for i in range(repeats):
+        for engine in engines:
+            folder = base / f"speed-{engine}-{i}"
+            summary = demo(folder, "--engine", engine)
+            found[engine].append(speed(folder))
+            if engine == "python":
+                summaries.append(without_wall_clock({k: v for k, v in summary.items() if k != "folder"}))
+    rows = []
+    for engine, reach in (("python", 10), ("numba", 20)):
+        if engine in found:
+            values = found[engine]
+            text = f"{statistics.median(values):.1f} (of {len(values)}: {min(values):.1f} to {max(values):.1f})"
+            rows.append((f"lockstep at 250 Hz, times real time, {engine}", f">= {reach}", text))
+    if len(summaries) > 1:
+        same = all(s == summaries[0] for s in summaries)
+        rows.append(("same seed, same summary", "identical", "identical" if same else "DIFFERENT"))
+    return rows
+
+
+def median_us(call: Callable[[int], object], count: int = 4000) -> float:
+    """The median duration of a call [us]."""
+    for i in range(200):
+        call(i)
+    times = []
+    for i in range(count):
+        begin = time.perf_counter_ns()
+        call(200 + i)
+        times.append(time.perf_counter_ns() - begin)
+    return statistics.median(times) * 1e-3
+
+
+def steps() -> list[tuple[str, str, str]]:
+    """The control step: the law with its prediction, and the whole step with reference and conversion around it."""
+    vehicle = load_flight("paper").vehicle
+    course = Course(load("paper"), vehicle, (0.0, 0.0, -10.0), 0.0, None)
+    state = State((0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1))
+    rows = []
+    for engine, reach in (("python", 40), ("numba", 5)):
+        if engine == "numba" and not accelerate.available():
+            continue
+        tracker = Tracker(vehicle, "rates", kernels(engine))
+        tracker.begin(state)
+        whole = median_us(lambda i, t=tracker: t.step(1.0 + 0.004 * i, state, course.at))  # type: ignore[misc]
+        reference, pieces = course.at(1.0), tracker._prediction.pieces(1.0 + 0.004 * 4300)
+        arithmetic = tracker._engine
+
+        def law_step(_: int, a: Any = arithmetic, r: Any = reference, p: Any = pieces) -> object:
+            return a.step(state, r, 46.0, p, False, True, 0.004)
+
+        law = median_us(law_step)
+        rows.append((f"control step with prediction, median, {engine}", f"< {reach} us", f"{law:.1f} us"))
+        rows.append(("  with reference, history and conversion", "", f"{whole:.1f} us"))
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one flight per kind")
+    parser.add_argument("--out", type=Path, help="keep the flight folders here")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        base = arguments.out or Path(temporary)
+        base.mkdir(parents=True, exist_ok=True)
+        rows = steps() + speeds(base, 1 if arguments.quick else 3) + flights(base, arguments.quick)
+    print(f"Python {platform.python_version()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
+    print("| figure | reach | seen |\n|---|---|---|")
+    for row in rows:
+        print(f"| {' | '.join(row)} |")
+
+
+if __name__ == "__main__":
+    main()
