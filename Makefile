@@ -5,12 +5,10 @@ PY := $(VENV)/bin/python
 
 # pip takes the pins from here, for the package and (by the second name, which older versions do not know) for what
 # builds it. What the caller's own settings say about where and what to install does not hold for $(VENV).
-export PIP_CONSTRAINT := constraints.txt
-export PIP_BUILD_CONSTRAINT := constraints.txt
-export PIP_DISABLE_PIP_VERSION_CHECK := 1
-export PIP_USER := 0
-unexport PIP_TARGET PIP_PREFIX PIP_ROOT PIP_REQUIREMENT PIP_EDITABLE PIP_NO_DEPS PIP_DRY_RUN
-unexport PIP_NO_BUILD_ISOLATION PIP_REQUIRE_HASHES PYTHONHOME PYTHONPATH
+PIP_INSTALL := env -u PIP_TARGET -u PIP_PREFIX -u PIP_ROOT -u PIP_REQUIREMENT -u PIP_EDITABLE -u PIP_NO_DEPS \
+  -u PIP_DRY_RUN -u PIP_NO_BUILD_ISOLATION -u PIP_REQUIRE_HASHES PIP_USER=0 PIP_DISABLE_PIP_VERSION_CHECK=1 \
+  PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt $(PY) -m pip install -q
+unexport PYTHONHOME PYTHONPATH
 
 .NOTPARALLEL:
 .PHONY: demo test test-plain lint format clean help
@@ -26,17 +24,17 @@ $(PY):
 # A stamp per set of packages: a second run installs nothing until the pins or the package's own needs change.
 $(VENV)/.run: pyproject.toml constraints.txt | $(PY)
 	@echo "installing into $(VENV) ..."
-	@$(PY) -m pip install -q -e .
+	@$(PIP_INSTALL) -e .
 	@touch $@
 
 $(VENV)/.test: pyproject.toml constraints.txt | $(PY)
 	@echo "installing into $(VENV), with what the tests need ..."
-	@$(PY) -m pip install -q -e '.[test,fast]'
+	@$(PIP_INSTALL) -e '.[test,fast]'
 	@touch $(VENV)/.run $@
 
 $(VENV)/.lint: pyproject.toml constraints.txt | $(PY)
 	@echo "installing into $(VENV), with what the checks need ..."
-	@$(PY) -m pip install -q -e '.[test,fast,lint]'
+	@$(PIP_INSTALL) -e '.[test,fast,lint]'
 	@touch $(VENV)/.run $(VENV)/.test $@
 
 demo: $(VENV)/.run  ## Fly the paper's figure of eight on the bundled vehicle

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from .accelerate import choose
-from .estimator import Estimate, Estimator
-from .inner_loops import Setpoint, advance, initial_loops, make_gains
-from .loop_gains import hover_thrusts
+from .engines import Setup, make_engine
+from .estimator import Estimate, age_steps
+from .inner_loops import Setpoint, make_gains
+from .loop_gains import LoopGains, hover_thrusts
 from .physics import STANDARD_GRAVITY_M_S2, RigidState, at_rest, make_body
 from .rotation import Quat, Vec3, Vec4
 from .vehicle_file import VehicleFile
@@ -74,71 +74,103 @@ class Airframe:
         """One step."""
         self.t_us = START_US
         """Vehicle time."""
-        self.on_ground = start is None or start[0][2] >= world.ground_d_m
-        self.impact_speed_m_s = 0.0
-        """Downward speed of the hardest touchdown so far."""
+        self.age_steps = age_steps(vehicle, self.dt_us)
+        """How old an estimate is when it is published."""
         gravity = STANDARD_GRAVITY_M_S2 * world.gravity_factor
         self._body = make_body(vehicle, gravity)
-        self._gains = make_gains(vehicle, px4)
-        self._advance = choose(advance, engine)
-        self._force_n = world.force_n
-        self._dt_s = self.dt_us * 1.0e-6
-        self._steps_per_gust = max(1, round(_GUST_PERIOD_S / self._dt_s))
-        self._steps_to_gust = self._steps_per_gust
-        period_s = self._steps_per_gust * self._dt_s
+        self._steps_per_gust = max(1, round(_GUST_PERIOD_S / (self.dt_us * 1.0e-6)))
+        self._gust_phase = 0
+        """Steps since the gusts changed last, or would have changed."""
+        period_s = self._steps_per_gust * (self.dt_us * 1.0e-6)
         self._wind = Wind(world.wind_m_s, world.turbulence, seed=world.seed, period_s=period_s)
-        self.rigid = self._start(start)
-        """True mechanical state."""
-        self._loops = initial_loops(self.rigid.w)
-        self._estimator = Estimator(vehicle, seed=seed, t_us=self.t_us, rigid=self.rigid, dt_us=self.dt_us)
+        self._engine = make_engine(
+            engine,
+            Setup(
+                vehicle,
+                self._start(start),
+                self._body,
+                make_gains(vehicle, px4),
+                world.ground_d_m,
+                start is None or start[0][2] >= world.ground_d_m,
+                self.t_us,
+                self.dt_us,
+                seed,
+            ),
+        )
+        self._thrust_factor = 1.0
+        self._engine.force_n = world.force_n
+        self._engine.air_m_s = self._wind.air_m_s
 
     def _start(self, start: tuple[Vec3, float] | None) -> RigidState:
         if start is None:
             return at_rest((0.0, 0.0, self.world.ground_d_m), 0.0, (0.0, 0.0, 0.0, 0.0))
         p, yaw = start
         mass = self._body.mass_kg
-        load = mass * (self._body.gravity_m_s2 + self._body.drag_1_s * self._wind.air_m_s[2]) + self._force_n[2]
+        load = mass * (self._body.gravity_m_s2 + self._body.drag_1_s * self._wind.air_m_s[2])
+        load += self.world.force_n[2]
         load = min(max(load, 0.0), 4.0 * self._body.rotor_thrust_max_n)
         return at_rest(p, yaw, hover_thrusts(self.vehicle, load))
 
+    @property
+    def rigid(self) -> RigidState:
+        """True mechanical state."""
+        return self._engine.rigid
+
+    @property
+    def on_ground(self) -> bool:
+        """Whether the vehicle touches the ground."""
+        return self._engine.on_ground
+
+    @property
+    def impact_speed_m_s(self) -> float:
+        """Downward speed of the hardest touchdown so far."""
+        return self._engine.impact_speed_m_s
+
     def advance(self, setpoint: Setpoint, fresh: bool, n_steps: int) -> None:
         """Run n_steps physics steps with one setpoint; `fresh`: it is a new one (acts on the first step)."""
-        for _ in range(n_steps):
-            self.rigid, self._loops, touch = self._advance(
-                self.rigid,
-                self._loops,
-                setpoint,
-                fresh,
-                self._wind.air_m_s,
-                self._force_n,
-                self._body,
-                self._gains,
-                self.world.ground_d_m,
-                self._dt_s,
-                1,
-            )
+        engine, wind = self._engine, self._wind
+        while n_steps > 0:
+            gusty = wind.gusty
+            steps = min(n_steps, self._steps_per_gust - self._gust_phase) if gusty else n_steps
+            engine.run(setpoint, fresh, steps)
             fresh = False
-            self.t_us += self.dt_us
-            self.on_ground = touch.on_ground
-            self.impact_speed_m_s = max(self.impact_speed_m_s, touch.impact_m_s)
-            self._estimator.push(self.t_us, self.rigid)
-            self._steps_to_gust -= 1
-            if self._steps_to_gust == 0:
-                self._steps_to_gust = self._steps_per_gust
-                self._wind.advance()
+            n_steps -= steps
+            self.t_us += steps * self.dt_us
+            self._gust_phase = (self._gust_phase + steps) % self._steps_per_gust
+            if gusty and self._gust_phase == 0:
+                wind.advance()
+                engine.air_m_s = wind.air_m_s
 
-    def believed(self) -> Estimate:
-        """Return what the vehicle believes: late and noisy, stamped with the sample's time."""
-        return self._estimator.believed()
+    def believed(self, steps_ahead: int = 0) -> Estimate:
+        """Return what the vehicle believes: late and noisy, stamped with the sample's time.
+
+        With steps_ahead, at most `age_steps`: what it will believe in so many steps, which is the past already.
+        """
+        return self._engine.believed(steps_ahead)
 
     def inner_state(self) -> RigidState:
         """Return the state without delay and noise that the autopilot's own loops use."""
-        return self.rigid
+        return self._engine.rigid
+
+    def rates_followed(self) -> Vec3:
+        """Return the body rates that the rate loop follows [rad/s]."""
+        return self._engine.rates
+
+    def set_gains(self, gains: LoopGains) -> None:
+        """Change the constants of the inner loops from now on."""
+        self._engine.gains = gains
+
+    def set_thrust_factor(self, factor: float) -> None:
+        """Change every rotor's thrust, as a share of the vehicle file's, from now on."""
+        if factor != self._thrust_factor:
+            self._thrust_factor = factor
+            full_n = self.vehicle.rotor_thrust_max_n
+            self._engine.set_body(self._body._replace(rotor_thrust_max_n=factor * full_n))
 
     def truth(self) -> Truth:
         """Return the truth now; on the ground the disturbance leaves out what the ground does."""
-        r = self.rigid
-        air, force, body = self._wind.air_m_s, self._force_n, self._body
+        r = self._engine.rigid
+        air, force, body = self._wind.air_m_s, self._engine.force_n, self._body
         disturbance = (
             body.drag_1_s * air[0] + force[0] / body.mass_kg,
             body.drag_1_s * air[1] + force[1] / body.mass_kg,
@@ -149,7 +181,8 @@ class Airframe:
     def set_wind(self, wind_m_s: Vec3, turbulence: float) -> None:
         """Change the mean wind (NED) in a step, and its turbulence, from now on."""
         self._wind.set_wind(wind_m_s, turbulence)
+        self._engine.air_m_s = self._wind.air_m_s
 
     def set_force(self, force_n: Vec3) -> None:
         """Change the constant force (NED) from now on."""
-        self._force_n = force_n
+        self._engine.force_n = force_n

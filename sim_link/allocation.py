@@ -63,12 +63,19 @@ def _room(base: float, added: float, upper: float) -> float:
 
 
 def _fitting(base: Vec4, added: Vec4, upper: float) -> float:
+    """Return the largest factor within 0..1 on `added` that keeps all four of base + factor added within 0..upper."""
     return min(
         _room(base[0], added[0], upper),
         _room(base[1], added[1], upper),
         _room(base[2], added[2], upper),
         _room(base[3], added[3], upper),
     )
+
+
+def _within_range(shares: Vec4) -> bool:
+    """Return whether no rotor is beyond its range: then there is nothing to desaturate."""
+    a, b, c, d = shares
+    return 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 and 0.0 <= c <= 1.0 and 0.0 <= d <= 1.0
 
 
 def allocate(torque: Vec3, thrust: float, gains: LoopGains) -> tuple[Vec4, Vec3]:
@@ -87,10 +94,14 @@ def allocate(torque: Vec3, thrust: float, gains: LoopGains) -> tuple[Vec4, Vec3]
         return _STOPPED, (0.0, 0.0, 0.0)
     lift = _scaled(gains.mix_thrust, clip(thrust, 0.0, 1.0))
     tilt = _sum(_scaled(gains.mix_roll, torque[0]), _scaled(gains.mix_pitch, torque[1]))
-    lift = _sum(lift, _scaled(gains.mix_thrust, -_thrust_reduction(_sum(lift, tilt), gains.mix_thrust)))
+    turn = _scaled(gains.mix_yaw, torque[2])
+    shares = _sum(lift, tilt)
+    turned = _sum(shares, turn)
+    if _within_range(shares) and _within_range(turned):
+        return turned, (1.0, 1.0, 1.0)
+    lift = _sum(lift, _scaled(gains.mix_thrust, -_thrust_reduction(shares, gains.mix_thrust)))
     tilt_share = _fitting(lift, tilt, 1.0)
     shares = _sum(lift, _scaled(tilt, tilt_share))
-    turn = _scaled(gains.mix_yaw, torque[2])
     turn_share = _fitting(shares, turn, 1.0 + _YAW_HEADROOM)
     shares = _sum(shares, _scaled(turn, turn_share))
     shares = _sum(shares, _scaled(gains.mix_thrust, -_thrust_reduction(shares, gains.mix_thrust)))

@@ -10,20 +10,26 @@ import math
 from enum import IntEnum
 
 from .codec import ActuatorControls, AttitudeTarget
-from .failsafe import Action, Cause, Decision, Health, decide
+from .failsafe import Action, Cause, Decision, Health, decide, fence_action
+from .geofence import Geofence
 from .guidance import Guidance
 from .inner_loops import ATTITUDE, STOPPED_SETPOINT, Setpoint
 from .land_detector import LandDetector, Motion
+from .manual_control import ManualInput
+from .missions import Plans
 from .modes import Mode
-from .offboard import Offboard, Order
+from .offboard import Offboard, Order, PositionTarget
 from .parameters import Parameters
 from .physics import RigidState
+from .position_loop import PositionSetpoint
 from .rotation import Vec3, yaw_of
-from .steering import IDLE, Steering, centred
+from .steering import IDLE, Steering
+from .stick_flight import CENTRED, AttitudeSticks
 from .watch import DisarmTimer, TiltWatch
 
 HEALTH_PERIOD_US = 100_000
 WATCH_PERIOD_US = 20_000
+FENCE_PERIOD_US = 200_000
 EARLY_FLIGHT_S = 3.0
 """After the spool-up: so long a tilt failure disarms."""
 TILT_BREAKER = 121212
@@ -32,6 +38,8 @@ _LONG_AGO_US = 60_000_000
 EMERGENCY, CRITICAL, WARNING, NOTICE, INFO = 0, 2, 4, 5, 6
 """MAV_SEVERITY"""
 
+_VERTICAL_INTENT_M_S = 0.05
+"""Vertical speed that a trajectory must ask for to mean a takeoff or a landing."""
 _RATE_OR_LEVEL = (Mode.STABILIZED, Mode.MANUAL, Mode.ACRO)
 
 
@@ -43,6 +51,7 @@ class Result(IntEnum):
     DENIED = 2
     UNSUPPORTED = 3
     FAILED = 4
+    IN_PROGRESS = 5
 
 
 class Autopilot:
@@ -62,8 +71,14 @@ class Autopilot:
     ) -> None:
         self.parameters = parameters
         self.px4 = px4
+        self.system = system
+        self.plans = Plans()
+        self.sticks = ManualInput(parameters)
+        self.fence = Geofence(parameters, self.plans)
+        self.battery_charge = 1
+        """MAV_BATTERY_CHARGE_STATE, as whoever watches the battery reports it."""
         self.offboard = Offboard(parameters, px4, system, setpoint_delay_us)
-        self.guidance = Guidance(parameters, home)
+        self.guidance = Guidance(parameters, home, self.plans)
         self.land = LandDetector(parameters, landed=not in_air)
         self.armed = in_air
         self.mode = Mode.HOLD
@@ -85,13 +100,18 @@ class Autopilot:
         self._armed_us = now_us - _LONG_AGO_US
         self._took_off = in_air
         self._offboard_ok = False
-        self._sticks_us: int | None = None
         self._ground_us: int | None = None
         self._sticks_at_arming = False
         self._lost_us: dict[Cause, int] = {}
         self._disarm_timer = DisarmTimer(parameters)
         self._tilt = TiltWatch(parameters)
         self._steering = Steering(parameters)
+        self._attitude_sticks = AttitudeSticks(parameters)
+        self._fence_us = now_us
+        self._breach: str | None = None
+        self._fence_overruled = False
+        self._home_is_set = False
+        self._offboard_takeoff = False
         self.guidance.enter(Mode.HOLD, rigid.p, rigid.v, yaw_of(rigid.q), rigid.p)
 
     # Requests
@@ -101,6 +121,7 @@ class Autopilot:
         if self.terminated or mode is Mode.TERMINATION or (self.armed and not self._can_run(mode)):
             self._say(CRITICAL, f"Switching to mode '{mode.label}' is currently not possible")
             return Result.TEMPORARILY_REJECTED
+        self._fence_overruled = self._breach is not None
         if mode is not self.intended:
             self.intended = mode
             if mode is not Mode.TAKEOFF:
@@ -125,7 +146,8 @@ class Autopilot:
         self._armed_us = self._now_us
         self._took_off = False
         self._sticks_at_arming = self.sticks_ok
-        self.guidance.home = self._rigid.p
+        if not self._home_is_set:
+            self.guidance.home = self._rigid.p
         self.guidance.enter(self.mode, self._rigid.p, self._rigid.v, yaw_of(self._rigid.q))
         self.offboard.evaluate(self._now_us)
         self._say(INFO, "Armed by external command")
@@ -144,6 +166,40 @@ class Autopilot:
         self._terminate("Flight termination commanded")
         return Result.ACCEPTED
 
+    def start_mission(self, first: int) -> Result:
+        """Fly the mission from an item on, arming if need be (MISSION_START); -1: from the current one."""
+        if not self.guidance.mission.can_run:
+            self._say(CRITICAL, "Mission start denied! No valid mission")
+            return Result.DENIED
+        if first >= 0 and not self.guidance.mission.select(first):
+            return Result.UNSUPPORTED
+        result = self.set_mode(Mode.MISSION)
+        return self.arm() if result is Result.ACCEPTED else result
+
+    def go_to(self, target: Vec3, yaw: float, speed_m_s: float | None) -> Result:
+        """Fly to a position NED [m] and hold there; NaN: as it is now (DO_REPOSITION)."""
+        result = self.set_mode(Mode.HOLD)
+        if result is Result.ACCEPTED:
+            here = self._rigid.p
+            n, e, d = (there if math.isfinite(there) else now for there, now in zip(target, here, strict=True))
+            self.guidance.go_to((n, e, d), yaw, speed_m_s)
+        return result
+
+    def set_home(self, home: Vec3 | None) -> Result:
+        """Put home somewhere, NED [m]; None: here. It then stays there when the vehicle is armed."""
+        self.guidance.home = self._rigid.p if home is None else home
+        self._home_is_set = True
+        return Result.ACCEPTED
+
+    def check_arming(self) -> Result:
+        """Say what stands in the way of arming (RUN_PREARM_CHECKS)."""
+        if self.armed:
+            return Result.TEMPORARILY_REJECTED
+        reason = self._arming_obstacle()
+        if reason is not None:
+            self._say(CRITICAL, f"Preflight Fail: {reason}")
+        return Result.ACCEPTED
+
     def attitude_target(self, message: AttitudeTarget) -> bool:
         """Take a SET_ATTITUDE_TARGET; returns whether it was accepted."""
         taken = self.offboard.take_attitude_target(message, self._now_us, self.mode is Mode.OFFBOARD)
@@ -158,10 +214,34 @@ class Autopilot:
             self._check()
         return taken
 
-    def manual_control(self) -> None:
-        """Take note of a MANUAL_CONTROL message: sticks are there if COM_RC_IN_MODE lets a joystick be a source."""
-        if self.parameters.integer("COM_RC_IN_MODE") in (1, 2, 3):
-            self._sticks_us = self._now_us
+    def position_target(self, message: PositionTarget, *, is_global: bool = False) -> None:
+        """Take a SET_POSITION_TARGET_LOCAL_NED or _GLOBAL_INT."""
+        active, before = self.mode is Mode.OFFBOARD, self.offboard.accepted
+        if is_global:
+            wrong = self.offboard.take_global_target(message, self._now_us, active, self.guidance.home)
+        else:
+            wrong = self.offboard.take_position_target(message, self._now_us, active, self._rigid.q)
+        if wrong is not None:
+            self._say(CRITICAL, wrong)
+        if self.offboard.accepted > before and not self._offboard_ok:
+            self._check()
+
+    def manual_control(self, x: int = 0, y: int = 0, z: int = 500, r: int = 0) -> None:
+        """Take a MANUAL_CONTROL: pitch, roll and yaw -1000..1000, throttle 0..1000; sticks are centred without."""
+        if self.sticks.joystick(x, y, z, r, self._now_us):
+            self._take_over()
+
+    def radio(self, channels: tuple[int, ...]) -> None:
+        """Take a RC_CHANNELS_OVERRIDE [us]."""
+        if self.sticks.radio(channels, self._now_us):
+            self._take_over()
+
+    def _take_over(self) -> None:
+        """Give the pilot, who moves the sticks, the vehicle: Position, or what can run of the others."""
+        if not self.armed or self.mode.needs_sticks or self.land.landed or self.terminated:
+            return
+        if self.set_mode(Mode.POSITION) is Result.ACCEPTED:
+            self._say(INFO, "Pilot took over using sticks")
 
     def ground_heartbeat(self) -> None:
         """Take note of a ground station's heartbeat."""
@@ -172,8 +252,7 @@ class Autopilot:
     @property
     def sticks_ok(self) -> bool:
         """Whether a source of manual control is there."""
-        limit_s = self.parameters.number("COM_RC_LOSS_T")
-        return self._sticks_us is not None and (self._now_us - self._sticks_us) * 1e-6 <= limit_s
+        return self.sticks.now(self._now_us) is not None
 
     @property
     def ground_ok(self) -> bool:
@@ -187,6 +266,21 @@ class Autopilot:
     def in_failsafe(self) -> bool:
         """Whether a failsafe acts. One without an action does not count: PX4 shows nothing of it either."""
         return self.failsafe is not None and self.failsafe.action is not Action.NONE
+
+    @property
+    def position_setpoint(self) -> PositionSetpoint | None:
+        """What the position controller flies, or flew last; None: nothing yet."""
+        return self._steering.target
+
+    @property
+    def breach(self) -> str | None:
+        """Which limit of the geofence the vehicle is beyond."""
+        return self._breach
+
+    @property
+    def arming_obstacle(self) -> str | None:
+        """Why arming would be denied; None: it would not."""
+        return self._arming_obstacle()
 
     @property
     def ready_to_arm(self) -> bool:
@@ -204,6 +298,9 @@ class Autopilot:
         if now_us >= self._watch_us:
             self._watch_us += WATCH_PERIOD_US
             self._watch(now_us, rigid)
+        if now_us >= self._fence_us:
+            self._fence_us += FENCE_PERIOD_US
+            self._watch_fence(rigid.p)
         order = self._order(rigid, dt_s)
         self.held = order.setpoint
         if order.setpoint.mode == ATTITUDE:
@@ -218,19 +315,23 @@ class Autopilot:
     def _watch(self, now_us: int, rigid: RigidState) -> None:
         """Run the land and tilt detectors and act on what they say."""
         thrust = self.held.thrust
-        climb_controlled = self.mode is not Mode.OFFBOARD and self.mode not in _RATE_OR_LEVEL
+        trajectory = self.mode is Mode.OFFBOARD and self.offboard.follows_trajectory
+        climb_controlled = trajectory or (self.mode is not Mode.OFFBOARD and self.mode not in _RATE_OR_LEVEL)
+        descending = self._trajectory_goes(rigid.p, down=True) if trajectory else self.guidance.descending
         motion = Motion(
             rigid.v,
             rigid.w,
             0.0 if math.isnan(thrust) else thrust,
             climb_controlled,
-            climb_controlled and self.guidance.descending,
+            climb_controlled and descending,
             self.armed,
         )
         self.land.update(motion, now_us)
         if not self.armed:
             return
         self._took_off = self._took_off or not self.land.landed
+        self.guidance.observe(rigid.p, self.land.landed, self.sticks.now(now_us))
+        self._follow_mission()
         if self.mode is Mode.TAKEOFF and self.guidance.takeoff_done:
             self.intended = Mode.HOLD
             self._evaluate()
@@ -243,6 +344,37 @@ class Autopilot:
         )
         if self._tilt.failed(now_us, rigid.q, attitude_controlled):
             self._tilt_failure(now_us)
+
+    def _follow_mission(self) -> None:
+        """Do what the mission wants of the autopilot: home, Return, or Hold at its end."""
+        mission = self.guidance.mission
+        if self.mode is not Mode.MISSION:
+            return
+        if mission.home_here:
+            mission.home_here = False
+            self.set_home(None)
+        if mission.finished or self.guidance.wants_return:
+            self.intended = Mode.HOLD if mission.finished else Mode.RETURN
+            self._evaluate()
+
+    def _watch_fence(self, p: Vec3) -> None:
+        """Look whether the vehicle is within the geofence, and act when it is not."""
+        before, self._breach = self._breach, self.fence.breach(p, self.guidance.home)
+        if self._breach is None:
+            self._fence_overruled = False
+        if (self._breach is None) != (before is None):
+            if self._breach is not None:
+                self._say(CRITICAL, f"Geofence violation: {self._breach}")
+            self._evaluate()
+
+    def report_battery(self, charge: int) -> None:
+        """Take note of the battery's MAV_BATTERY_CHARGE_STATE."""
+        if charge > self.battery_charge:
+            word = {2: "Low battery", 3: "Critical battery", 4: "Emergency battery level"}[charge]
+            self._say(CRITICAL if charge > 2 else WARNING, word)
+        if charge != self.battery_charge:
+            self.battery_charge = charge
+            self._evaluate()
 
     def _tilt_failure(self, now_us: int) -> None:
         """Answer a tilt beyond FD_FAIL_R or FD_FAIL_P: early in a flight disarm, later terminate if that is enabled."""
@@ -259,20 +391,66 @@ class Autopilot:
         if not self.armed or self.terminated:
             order = Order(STOPPED_SETPOINT, False)
         elif self.mode is Mode.OFFBOARD:
+            self.offboard.choose(self._now_us)
+            if self.offboard.follows_trajectory:
+                return self._trajectory_order(rigid, dt_s)
             order = self.offboard.order(self._now_us, self.held)
         elif self.mode in _RATE_OR_LEVEL:
-            order = Order(IDLE if self.land.landed else centred(self.mode, rigid.q, self.parameters), True)
+            order = self._stick_order(rigid, dt_s)
         elif self._stays_on_ground():
             order = Order(IDLE, False)
         else:
-            return Order(self._steering.setpoint(self.guidance, rigid, dt_s), True)
+            return Order(self._steering.guided(self.guidance, rigid, dt_s), True)
         self._steering.rest()
         return order
+
+    def _stick_order(self, rigid: RigidState, dt_s: float) -> Order:
+        """Give what the sticks fly without the position controller; on the ground with the throttle up only."""
+        sticks = self.sticks.now(self._now_us) or CENTRED
+        if self.land.landed and sticks.throttle <= 0.0:
+            self._attitude_sticks.rest()
+            return Order(IDLE, True)
+        return Order(self._attitude_sticks.setpoint(self.mode, sticks, rigid.q, dt_s), True)
+
+    def _trajectory_order(self, rigid: RigidState, dt_s: float) -> Order:
+        """Give what a companion's position, velocity or acceleration flies."""
+        target = self.offboard.trajectory(self._now_us)
+        on_ground = self.land.landed or (self._offboard_takeoff and not self._spooled_up)
+        if target is None or (self.land.landed and not self._trajectory_goes(rigid.p, down=False)):
+            self._steering.rest()
+            return Order(IDLE if self.land.landed else self.held, False)
+        if on_ground:
+            self._offboard_takeoff = True
+            if not self._spooled_up:
+                self._steering.rest()
+                return Order(IDLE, False)
+            if self.land.landed:
+                self._steering.begin_takeoff()
+                self.land.lift()
+        self._offboard_takeoff = False
+        return Order(self._steering.setpoint(target, rigid, dt_s), True)
+
+    def _trajectory_goes(self, p: Vec3, *, down: bool) -> bool:
+        """Tell whether a companion's trajectory leads down, or up."""
+        target = self.offboard.trajectory(self._now_us)
+        if target is None:
+            return False
+        speed = 0.0 if math.isnan(target.v[2]) else target.v[2]
+        if not math.isnan(target.p[2]):
+            speed += self.parameters.number("MPC_Z_P") * (target.p[2] - p[2])
+        elif math.isnan(target.v[2]) and not math.isnan(target.a[2]):
+            speed = target.a[2]
+        return speed > _VERTICAL_INTENT_M_S if down else speed < -_VERTICAL_INTENT_M_S
+
+    @property
+    def _spooled_up(self) -> bool:
+        """Whether the rotors have had COM_SPOOLUP_TIME since arming."""
+        return (self._now_us - self._armed_us) * 1e-6 >= self.parameters.number("COM_SPOOLUP_TIME")
 
     def _stays_on_ground(self) -> bool:
         """Tell whether a mode that steers itself keeps the rotors idling."""
         if self.guidance.wants_to_fly():
-            return (self._now_us - self._armed_us) * 1e-6 < self.parameters.number("COM_SPOOLUP_TIME")
+            return not self._spooled_up
         return self.land.landed or (self.guidance.descending and self.land.ground_contact)
 
     # Failsafe and arming
@@ -289,7 +467,14 @@ class Autopilot:
         """Choose what is flown: the mode that was asked for, or a failsafe's."""
         decision = None
         if self.armed and not self.terminated:
-            health = Health(self._offboard_ok, self.sticks_ok, self._sticks_at_arming, self.ground_ok)
+            health = Health(
+                self._offboard_ok,
+                self.sticks_ok,
+                self._sticks_at_arming,
+                self.ground_ok,
+                self._breach is None or self._fence_overruled,
+                self.battery_charge,
+            )
             decision = self._delayed(decide(self.intended, health, self.parameters))
         changed = decision != self.failsafe
         self.failsafe = decision
@@ -305,7 +490,8 @@ class Autopilot:
 
     def _delayed(self, decision: Decision | None) -> Decision | None:
         """Hold for COM_FAIL_ACT_T before a link loss acts. The loss of the offboard signal acts at once."""
-        if decision is None or decision.cause is Cause.OFFBOARD_LOST or decision.action is Action.NONE:
+        at_once = (Cause.OFFBOARD_LOST, Cause.FENCE)
+        if decision is None or decision.cause in at_once or decision.action is Action.NONE:
             self._lost_us.clear()
             return decision
         since = self._lost_us.setdefault(decision.cause, self._now_us)
@@ -329,7 +515,7 @@ class Autopilot:
         if mode is Mode.OFFBOARD:
             return self._offboard_ok
         if mode is Mode.MISSION:
-            return False
+            return self.guidance.mission.can_run
         return self.sticks_ok or not mode.needs_sticks
 
     def _arming_obstacle(self) -> str | None:
@@ -342,12 +528,16 @@ class Autopilot:
             return f"mode {self.intended.label} prevents it, switch to another one first"
         if self.intended is Mode.OFFBOARD and not self._offboard_ok:
             return "no offboard signal"
-        if self.intended is Mode.MISSION:
+        if self.intended is Mode.MISSION and not self.guidance.mission.can_run:
             return "no valid mission"
         if self.intended.needs_sticks and not self.sticks_ok:
             return "no manual control input"
         if not self.ground_ok:
             return "no connection to the ground control station"
+        if self._breach is not None and fence_action(self.parameters) is not Action.NONE:
+            return f"geofence violation, {self._breach}"
+        if self.battery_charge > 1:
+            return "low battery"
         return None
 
     def _disarm(self, sentence: str) -> None:

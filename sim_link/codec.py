@@ -43,6 +43,8 @@ SIGNATURE_LENGTH = 13
 AUTOPILOT_COMPONENT = 1
 """MAV_COMP_ID_AUTOPILOT1: what every vehicle's autopilot is."""
 _HEADER = struct.Struct("<BBBBBBBHB")
+_WHOLE = 12
+"""Bytes of a MAVLink 2 frame without its payload."""
 _CHECKED: dict[int, tuple[bytes, int]] = {
     number: (bytes((cls.crc_extra,)), cls.unpacker.size) for number, cls in mavlink.mavlink_map.items()
 }
@@ -65,11 +67,11 @@ ID_HIL_STATE_QUATERNION = 115
 ID_SET_ACTUATOR_CONTROL_TARGET = 139
 ID_ODOMETRY = 331
 
-ODOMETRY_HEAD = struct.Struct("<Q13f")
-"""time_usec, x, y, z, q, vx, vy, vz, rollspeed, pitchspeed, yawspeed; covariances and a tail follow."""
-ODOMETRY_TAIL = struct.Struct("<BBBBb")
-"""frame_id, child_frame_id, reset_counter, estimator_type, quality."""
+ODOMETRY = struct.Struct("<Q13f168sBBBBb")
+"""time_usec, x, y, z, q, vx, vy, vz, rollspeed, pitchspeed, yawspeed; two covariances; frame_id, child_frame_id,
+reset_counter, estimator_type, quality."""
 COVARIANCE = struct.Struct("<21f")
+"""Upper triangle of pose or velocity."""
 ATTITUDE_QUATERNION = struct.Struct("<I7f4f")
 LOCAL_POSITION_NED = struct.Struct("<I6f")
 GLOBAL_POSITION_INT = struct.Struct("<IiiiihhhH")
@@ -119,6 +121,13 @@ def frames(datagram: bytes) -> list[Frame]:
     found: list[Frame] = []
     at = 0
     end = len(datagram)
+    if end >= _WHOLE and datagram[0] == MAGIC_V2 and datagram[1] + _WHOLE == end and datagram[2] == 0:
+        # Nearly every datagram: one frame of MAVLink 2, not signed. What is wrong with it is sorted out below.
+        _, _, _, _, _, system, component, low, high = _HEADER.unpack_from(datagram)
+        msg_id = low | high << 16
+        known = _CHECKED.get(msg_id)
+        if known is not None and mcrf4xx(datagram[1:-2] + known[0]) == datagram[-2] | datagram[-1] << 8:
+            return [Frame(msg_id, system, component, datagram[10:-2], datagram)]
     while at < end:
         magic = datagram[at]
         length = 0

@@ -48,6 +48,8 @@ class Cause(Enum):
     OFFBOARD_LOST = "Offboard signal lost"
     STICKS_LOST = "Manual control signal lost"
     GROUND_LOST = "Ground station connection lost"
+    FENCE = "Geofence violation"
+    BATTERY = "Battery low"
 
 
 class Decision(NamedTuple):
@@ -66,6 +68,10 @@ class Health(NamedTuple):
     sticks_at_arming: bool
     ground_ok: bool
     """A ground station's heartbeat is there."""
+    fence_ok: bool = True
+    """The vehicle is within the geofence, or the pilot has overruled it."""
+    battery: int = 1
+    """MAV_BATTERY_CHARGE_STATE."""
 
 
 # COM_OBL_RC_ACT. The first three need sticks.
@@ -81,6 +87,21 @@ _OFFBOARD_LOSS = {
 }
 # NAV_RCL_ACT and NAV_DLL_ACT; 0 is "disabled", and NAV_RCL_ACT's 7 "Hold, no failsafe" gives no action here either.
 _LINK_LOSS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
+# GF_ACTION: 0 none, 1 a warning.
+_FENCE = {2: Action.HOLD, 3: Action.RETURN, 4: Action.TERMINATE, 5: Action.LAND}
+BATTERY_CRITICAL, BATTERY_EMERGENCY = 3, 4
+_SEVERITY = (
+    Action.NONE,
+    Action.POSITION,
+    Action.ALTITUDE,
+    Action.STABILIZED,
+    Action.HOLD,
+    Action.RETURN,
+    Action.LAND,
+    Action.DISARM,
+    Action.TERMINATE,
+)
+"""Of several failsafes the one with the gravest action acts."""
 _STICK_ACTIONS = (Action.POSITION, Action.ALTITUDE, Action.STABILIZED)
 
 
@@ -96,10 +117,39 @@ def offboard_loss_action(parameters: Parameters, sticks_ok: bool) -> Action:
     return action
 
 
+def fence_action(parameters: Parameters) -> Action:
+    """Give GF_ACTION's action."""
+    return _FENCE.get(parameters.integer("GF_ACTION"), Action.NONE)
+
+
+def battery_action(parameters: Parameters, charge: int) -> Action:
+    """Give COM_LOW_BAT_ACT's action: 2 lands when critical, 3 returns when critical and lands in an emergency."""
+    act = parameters.integer("COM_LOW_BAT_ACT")
+    if act == 2 and charge >= BATTERY_CRITICAL:
+        return Action.LAND
+    if act == 3 and charge == BATTERY_CRITICAL:
+        return Action.RETURN
+    return Action.LAND if act == 3 and charge >= BATTERY_EMERGENCY else Action.NONE
+
+
 def decide(intended: Mode, health: Health, parameters: Parameters) -> Decision | None:
     """Give the failsafe for an armed vehicle in the mode it was asked to fly; None when nothing is lost."""
     if intended is Mode.TERMINATION:
         return None
+    decision = _link_decision(intended, health, parameters)
+    fence = Action.NONE if health.fence_ok else fence_action(parameters)
+    battery = battery_action(parameters, health.battery)
+    if intended is Mode.LAND and battery is Action.RETURN:
+        battery = Action.NONE
+    for action, cause in ((fence, Cause.FENCE), (battery, Cause.BATTERY)):
+        graver = decision is None or _SEVERITY.index(action) > _SEVERITY.index(decision.action)
+        if action is not Action.NONE and graver:
+            decision = Decision(action, cause)
+    return decision
+
+
+def _link_decision(intended: Mode, health: Health, parameters: Parameters) -> Decision | None:
+    """Give the failsafe for a lost link."""
     if intended is Mode.OFFBOARD and not health.offboard_ok:
         return Decision(offboard_loss_action(parameters, health.sticks_ok), Cause.OFFBOARD_LOST)
     # A stick mode needs its sticks; the others lose them only if they were there at arming.

@@ -1,4 +1,4 @@
-"""Where the vehicle flies in the modes in which it steers itself: Hold, Takeoff, Land, Return, Position, Altitude.
+"""Where the vehicle flies when it holds its own position: Hold, Takeoff, Mission, Land, Return, Position, Altitude.
 
 Gives position and velocity setpoints to the position controller; velocities follow a limited acceleration, as PX4's do.
 """
@@ -7,14 +7,20 @@ from __future__ import annotations
 
 import math
 
+from .manual_control import Sticks
+from .mission_flight import Kind, MissionFlight
+from .missions import Plans
 from .modes import Mode
 from .parameters import Parameters
 from .position_loop import PositionSetpoint
 from .rotation import Vec3
+from .stick_flight import CENTRED, acceleration, descent, turn_rate, velocity
 
 _NOTHING = (math.nan, math.nan, math.nan)
 _STOPPED_M_S = 0.3
 _NEAR_M = 0.3
+_TURN_FROM_M = 2.0
+"""Further away than this a mission turns the nose to where it flies."""
 _RETURN_NEAR_M = 10.0
 """Closer to home than this, Return neither climbs nor cruises (PX4: RTL_MIN_DIST)."""
 
@@ -22,9 +28,17 @@ _RETURN_NEAR_M = 10.0
 class Guidance:
     """The flight tasks. Positions are NED [m] as the estimator gives them, heights are above home."""
 
-    def __init__(self, parameters: Parameters, home: Vec3) -> None:
+    def __init__(self, parameters: Parameters, home: Vec3, plans: Plans | None = None) -> None:
         self._parameters = parameters
+        self._plans = Plans() if plans is None else plans
         self.home = home
+        self.mission = MissionFlight(parameters, self._plans)
+        self.sticks: Sticks | None = None
+        """For Position and Altitude; None: nobody has any."""
+        self.landed = False
+        """What the land detector says."""
+        self.speed_m_s: float | None = None
+        """Cruise speed asked for by a command; None: MPC_XY_CRUISE."""
         self.takeoff_height_m: float | None = None
         """Height above home that a takeoff command asked for; None: MIS_TAKEOFF_ALT above where it starts."""
         self.takeoff_done = False
@@ -37,7 +51,12 @@ class Guidance:
         self._ramp_s = 0.0
         self._takeoff_d = 0.0
         self._return_d = 0.0
+        self._return_to = home
         self._return_stage = 0
+        self._target: Vec3 | None = None
+        self._target_yaw = math.nan
+        self._height: float | None = None
+        self._here = home
 
     def enter(self, mode: Mode, p: Vec3, v: Vec3, yaw: float, anchor: Vec3 | None = None) -> None:
         """Begin a mode at the present position and velocity; `anchor`: a point to hold, so that nothing moves."""
@@ -48,12 +67,35 @@ class Guidance:
         self._ramp_s = 0.0
         self.descending = False
         self.takeoff_done = False
+        self._target = None
+        self._height = None
+        self.speed_m_s = None
         self._return_stage = 0
         climb = self._parameters.number("RTL_RETURN_ALT")
-        near = math.hypot(p[0] - self.home[0], p[1] - self.home[1]) < _RETURN_NEAR_M
+        self._return_to = self._nearest_return(p)
+        near = math.hypot(p[0] - self._return_to[0], p[1] - self._return_to[1]) < _RETURN_NEAR_M
         self._return_d = p[2] if near else min(p[2], self.home[2] - climb)
+        if mode is Mode.MISSION:
+            self.mission.enter()
+        else:
+            self.mission.leave()
         if mode is Mode.TAKEOFF:
             self._begin_takeoff(p)
+
+    def go_to(self, target: Vec3, yaw: float, speed_m_s: float | None) -> None:
+        """Fly to a position NED [m] and hold there (DO_REPOSITION); yaw [rad], NaN: as it is.
+
+        Only Hold does so: whoever calls this has changed to it.
+        """
+        self._target, self._target_yaw = target, yaw
+        self._anchor = None
+        if speed_m_s is not None:
+            self.speed_m_s = speed_m_s
+
+    def _nearest_return(self, p: Vec3) -> Vec3:
+        """Give where Return lands: home, or a rally point that is nearer."""
+        places = [self.home] + [point.position(self.home) for point in self._plans.rally_points]
+        return min(places, key=lambda place: math.hypot(place[0] - p[0], place[1] - p[1]))
 
     def _begin_takeoff(self, p: Vec3) -> None:
         """Fix the height of a takeoff; one that would lead down ends where it is."""
@@ -68,12 +110,20 @@ class Guidance:
 
     def wants_to_fly(self) -> bool:
         """Tell whether the mode lifts a vehicle that stands on the ground."""
+        if self._mode is Mode.MISSION:
+            return self._mission_leg is Kind.CLIMB or self._mission_leg is Kind.FLY
+        if self._mode in (Mode.POSITION, Mode.ALTITUDE):
+            return descent(self.sticks or CENTRED, self._parameters) < 0.0
         return self._mode is Mode.TAKEOFF
 
     def setpoint(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
         """Give the setpoint for the position controller; dt_s is the time since the last call."""
         if self._mode is Mode.TAKEOFF:
             return self._takeoff(p, v, dt_s)
+        if self._mode is Mode.MISSION:
+            return self._fly_mission(p, v, dt_s)
+        if self._mode is Mode.POSITION:
+            return self._position(p, v, dt_s)
         if self._mode is Mode.LAND:
             return self._land(p, v, dt_s, self._parameters.number("MPC_LAND_SPEED"))
         if self._mode is Mode.RETURN:
@@ -83,7 +133,13 @@ class Guidance:
         return self._hold(p, v, dt_s)
 
     def _hold(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
-        """Stop, then stay where that was."""
+        """Stop, then stay where that was; or fly to where it was told to, and stay there."""
+        self._turn(self._target_yaw if self._target is not None else math.nan, dt_s)
+        if self._target is not None and self._anchor is None:
+            self._approach(self._target, p, dt_s)
+            if math.dist(p, self._target) < _NEAR_M and math.hypot(*v) < _STOPPED_M_S:
+                self._anchor = self._target
+            return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, 0.0)
         if self._anchor is None:
             self._slew((0.0, 0.0, 0.0), dt_s)
             if max(math.hypot(*v), math.hypot(*self._v)) > _STOPPED_M_S:
@@ -91,16 +147,92 @@ class Guidance:
             self._anchor = p
         return PositionSetpoint(self._anchor, _NOTHING, _NOTHING, self._yaw, 0.0)
 
-    def _altitude(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
-        """Level, and stay at this height; nobody holds the position."""
-        if self._anchor is None:
-            self._slew((v[0], v[1], 0.0), dt_s)
-            if max(abs(v[2]), abs(self._v[2])) > _STOPPED_M_S:
-                vertical = (math.nan, math.nan, self._v[2])
-                return PositionSetpoint(_NOTHING, vertical, (0.0, 0.0, math.nan), self._yaw, 0.0)
+    def _position(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
+        """Fly as fast as the sticks say; with centred ones stop, then stay where that was."""
+        sticks = self.sticks or CENTRED
+        rate = turn_rate(sticks, self._parameters)
+        self._yaw += rate * dt_s
+        north, east = velocity(sticks, self._yaw, self._parameters)
+        down = descent(sticks, self._parameters)
+        self.descending = down > 0.0
+        if north or east or down or self._anchor is None:
+            self._anchor = None
+            self._slew((north, east, down), dt_s)
+            if north or east or down or max(math.hypot(*v), math.hypot(*self._v)) > _STOPPED_M_S:
+                return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, rate)
             self._anchor = p
-        height = (math.nan, math.nan, self._anchor[2])
-        return PositionSetpoint(height, _NOTHING, (0.0, 0.0, math.nan), self._yaw, 0.0)
+        return PositionSetpoint(self._anchor, _NOTHING, _NOTHING, self._yaw, rate)
+
+    def _altitude(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
+        """Tilt and climb as the sticks say; with the throttle centred stay at this height. Nobody holds position."""
+        sticks = self.sticks or CENTRED
+        rate = turn_rate(sticks, self._parameters)
+        self._yaw += rate * dt_s
+        north, east = acceleration(sticks, self._yaw, self._parameters)
+        down = descent(sticks, self._parameters)
+        self.descending = down > 0.0
+        if down or self._height is None:
+            self._height = None
+            self._slew((v[0], v[1], down), dt_s)
+            if down or max(abs(v[2]), abs(self._v[2])) > _STOPPED_M_S:
+                vertical = (math.nan, math.nan, self._v[2])
+                return PositionSetpoint(_NOTHING, vertical, (north, east, math.nan), self._yaw, rate)
+            self._height = p[2]
+        height = (math.nan, math.nan, self._height)
+        return PositionSetpoint(height, _NOTHING, (north, east, math.nan), self._yaw, rate)
+
+    @property
+    def _mission_leg(self) -> Kind:
+        """What the mission is at."""
+        return self.mission.leg(self._here, self.home, self.landed).kind
+
+    def _fly_mission(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
+        """Fly the mission's present leg."""
+        mission = self.mission
+        mission.update(p, self.landed, dt_s)
+        leg = mission.leg(p, self.home, self.landed)
+        if leg.kind in (Kind.NOTHING, Kind.RETURN):
+            return self._hold(p, v, dt_s)
+        if leg.kind is Kind.CLIMB:
+            self._takeoff_d = leg.target[2]
+            self._anchor = leg.target
+            return self._takeoff(p, v, dt_s)
+        away = math.hypot(leg.target[0] - p[0], leg.target[1] - p[1])
+        if leg.kind is Kind.LAND:
+            if away < _NEAR_M or self.descending:
+                self._anchor = (leg.target[0], leg.target[1], p[2])
+                return self._land(p, v, dt_s, self._landing_speed(p))
+            self._anchor = None
+            self._approach((leg.target[0], leg.target[1], p[2]), p, dt_s)
+            return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, 0.0)
+        self.descending = False
+        self._anchor = None
+        course = math.atan2(leg.target[1] - p[1], leg.target[0] - p[0]) if away > _TURN_FROM_M else math.nan
+        self._turn(course if math.isnan(leg.yaw) else leg.yaw, dt_s)
+        self._approach(leg.target, p, dt_s)
+        return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, 0.0)
+
+    @property
+    def wants_return(self) -> bool:
+        """Whether the mission goes on with Return."""
+        return self._mode is Mode.MISSION and self._mission_leg is Kind.RETURN
+
+    def observe(self, p: Vec3, landed: bool, sticks: Sticks | None) -> None:
+        """Take note of where the vehicle is, whether it stands, and of the sticks."""
+        self._here, self.landed, self.sticks = p, landed, sticks
+
+    def _landing_speed(self, p: Vec3) -> float:
+        """Give the speed of a descent to home's height: fast while high."""
+        high = self.home[2] - p[2] > self._parameters.number("RTL_DESCEND_ALT")
+        return self._parameters.number("MPC_Z_VEL_MAX_DN" if high else "MPC_LAND_SPEED")
+
+    def _turn(self, yaw: float, dt_s: float) -> None:
+        """Turn the heading towards `yaw` [rad]; NaN: it stays."""
+        if math.isnan(yaw):
+            return
+        error = math.remainder(yaw - self._yaw, 2.0 * math.pi)
+        most = math.radians(self._parameters.within("MPC_YAWRAUTO_MAX", 0.0, 360.0)) * dt_s
+        self._yaw += min(max(error, -most), most)
 
     def _takeoff(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
         """Climb straight up: a ramp of the speed, then a slower approach to the height."""
@@ -133,27 +265,28 @@ class Guidance:
 
     def _return(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
         """Climb to the return height, fly home at it, go down and land."""
-        to_home = math.hypot(self.home[0] - p[0], self.home[1] - p[1])
+        goal = self._return_to
+        to_home = math.hypot(goal[0] - p[0], goal[1] - p[1])
         if self._return_stage == 0 and p[2] - self._return_d < _NEAR_M:
             self._return_stage = 1
         if self._return_stage == 1 and to_home < _NEAR_M and math.hypot(v[0], v[1]) < _STOPPED_M_S:
             self._return_stage = 2
-            self._anchor = (self.home[0], self.home[1], p[2])
+            self._anchor = (goal[0], goal[1], p[2])
         if self._return_stage == 0:
             self._approach((p[0], p[1], self._return_d), p, dt_s)
         elif self._return_stage == 1:
-            self._approach((self.home[0], self.home[1], self._return_d), p, dt_s)
+            self._approach((goal[0], goal[1], self._return_d), p, dt_s)
         else:
-            high = self.home[2] - p[2] > self._parameters.number("RTL_DESCEND_ALT")
-            speed = self._parameters.number("MPC_Z_VEL_MAX_DN" if high else "MPC_LAND_SPEED")
-            return self._land(p, v, dt_s, speed)
+            return self._land(p, v, dt_s, self._landing_speed(p))
         return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, 0.0)
 
     def _approach(self, target: Vec3, p: Vec3, dt_s: float) -> None:
         """Turn the velocity setpoint towards a point, slower when near it."""
         north, east, down = target[0] - p[0], target[1] - p[1], target[2] - p[2]
         distance = math.hypot(north, east)
-        cruise = min(self._parameters.number("MPC_XY_CRUISE"), self._parameters.number("MPC_XY_P") * distance)
+        asked = self.mission.speed_m_s if self._mode is Mode.MISSION else None
+        asked = asked or self.speed_m_s or self._parameters.number("MPC_XY_CRUISE")
+        cruise = min(asked, self._parameters.number("MPC_XY_VEL_MAX"), self._parameters.number("MPC_XY_P") * distance)
         share = cruise / distance if distance > 0.0 else 0.0
         vertical = self._parameters.number("MPC_Z_P") * down
         vertical = max(vertical, -self._parameters.number("MPC_Z_VEL_MAX_UP"))

@@ -44,6 +44,7 @@ __all__ = [
     "Setpoint",
     "Touch",
     "advance",
+    "advance_step",
     "attitude_rates",
     "control",
     "filtered_attitude",
@@ -296,6 +297,43 @@ def control(
     return command, LoopState(integral, w, rates, q_ref, w_ref, age)
 
 
+def advance_step(
+    rigid: RigidState,
+    loops: LoopState,
+    setpoint: Setpoint,
+    fresh: bool,
+    air: Vec3,
+    force_n: Vec3,
+    body: Body,
+    gains: LoopGains,
+    ground_d_m: float,
+    dt_s: float,
+) -> tuple[RigidState, LoopState, float, float]:
+    """Run one step of loops, rotors, rigid body and ground: what both engines of the simulated vehicle repeat.
+
+    Args:
+        rigid: state now.
+        loops: the loops' state now (`initial_loops`).
+        setpoint: followed over the step.
+        fresh: it is a new one (NaN rates, reference model).
+        air: velocity of the air, NED [m/s], held over the step.
+        force_n: force from outside, NED [N], held over the step.
+        body: `physics.make_body`.
+        gains: `make_gains`.
+        ground_d_m: down coordinate of the ground [m].
+        dt_s: the step [s], the loops' period.
+
+    Returns:
+        Both states after the step, the speed at which the ground was met (`physics.contact`; -1.0 in the air), and
+        the speed [m/s] of a touchdown from the air, 0.0 when there was none.
+    """
+    on_ground = rigid.p[2] >= ground_d_m
+    command, loops_after = control(rigid, loops, setpoint, fresh, on_ground, gains, dt_s)
+    after = step(rigid, command, air, force_n, body, dt_s)
+    resting, sinking = contact(rigid, after, ground_d_m, body, dt_s)
+    return resting, loops_after, sinking, 0.0 if on_ground else max(sinking, 0.0)
+
+
 def advance(
     rigid: RigidState,
     loops: LoopState,
@@ -309,31 +347,14 @@ def advance(
     dt_s: float,
     n_steps: int,
 ) -> tuple[RigidState, LoopState, Touch]:
-    """Run n_steps of loops, rotors, rigid body and ground: the kernel of the simulated vehicle.
-
-    Args:
-        rigid: state now.
-        loops: the loops' state now (`initial_loops`).
-        setpoint: followed over all steps.
-        fresh: it is a new one: it acts on the first step (NaN rates, reference model).
-        air: velocity of the air, NED [m/s], held over the steps.
-        force_n: force from outside, NED [N], held over the steps.
-        body: `physics.make_body`.
-        gains: `make_gains`.
-        ground_d_m: down coordinate of the ground [m].
-        dt_s: one step [s], the loops' period.
-        n_steps: how many, at least 1.
-    """
-    on_ground = rigid.p[2] >= ground_d_m
+    """Run n_steps (at least 1) of `advance_step` with one setpoint; `fresh` acts on the first."""
+    sinking = -1.0
     impact = 0.0
     new = fresh
     for _ in range(n_steps):
-        command, loops = control(rigid, loops, setpoint, new, on_ground, gains, dt_s)
-        after = step(rigid, command, air, force_n, body, dt_s)
-        rigid, sinking = contact(rigid, after, ground_d_m, body, dt_s)
-        touching = sinking >= 0.0
-        if touching and not on_ground:
-            impact = max(impact, sinking)
-        on_ground = touching
+        rigid, loops, sinking, hit = advance_step(
+            rigid, loops, setpoint, new, air, force_n, body, gains, ground_d_m, dt_s
+        )
+        impact = max(impact, hit)
         new = False
-    return rigid, loops, Touch(on_ground, impact)
+    return rigid, loops, Touch(sinking >= 0.0, impact)

@@ -64,6 +64,11 @@ class LandDetector:
         self.maybe_landed = self._hold(1, maybe, self.maybe_landed, now_us)
         self.landed = self._hold(2, self.maybe_landed, self.landed, now_us)
 
+    def lift(self) -> None:
+        """Take note of a takeoff: what counted towards standing on the ground counts no more."""
+        self.ground_contact = self.maybe_landed = self.landed = False
+        self._since_us = [None, None, None]
+
     def _touches(self, motion: Motion) -> bool:
         """Tell whether the vehicle neither moves nor holds itself up."""
         v_n, v_e, v_d = motion.v

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, ID_TIMESYNC, Encoder, mavlink
+from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, Encoder
+from .link_rates import GROUND_HZ, ONBOARD_HZ
+
+__all__ = ["GROUND_HZ", "ONBOARD_HZ", "Link", "Stream"]
 
 _INT32_MAX = 2147483647
 
@@ -22,43 +25,6 @@ class Stream:
     """The present interval; 0: not sent."""
     due_us: int
     """Vehicle time of the next one."""
-
-
-def _id(name: str) -> int:
-    return int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
-
-
-# Rates in Hz as PX4 starts its links (mavlink_main.cpp), of the messages that this vehicle has. 0: only on request.
-ONBOARD_HZ: Mapping[int, float] = {
-    ID_HEARTBEAT: 1.0,
-    ID_TIMESYNC: 10.0,
-    _id("ODOMETRY"): 30.0,
-    _id("ATTITUDE_QUATERNION"): 50.0,
-    _id("LOCAL_POSITION_NED"): 30.0,
-    _id("GLOBAL_POSITION_INT"): 50.0,
-    _id("ATTITUDE_TARGET"): 10.0,
-    _id("SYS_STATUS"): 5.0,
-    _id("EXTENDED_SYS_STATE"): 5.0,
-    _id("ESTIMATOR_STATUS"): 1.0,
-    _id("HOME_POSITION"): 0.5,
-    _id("CURRENT_MODE"): 0.5,
-    _id("AUTOPILOT_VERSION"): 0.0,
-}
-GROUND_HZ: Mapping[int, float] = {
-    ID_HEARTBEAT: 1.0,
-    ID_TIMESYNC: 0.0,
-    _id("ODOMETRY"): 0.0,
-    _id("ATTITUDE_QUATERNION"): 50.0,
-    _id("LOCAL_POSITION_NED"): 50.0,
-    _id("GLOBAL_POSITION_INT"): 50.0,
-    _id("ATTITUDE_TARGET"): 50.0,
-    _id("SYS_STATUS"): 1.0,
-    _id("EXTENDED_SYS_STATE"): 1.0,
-    _id("ESTIMATOR_STATUS"): 0.5,
-    _id("HOME_POSITION"): 0.5,
-    _id("CURRENT_MODE"): 0.5,
-    _id("AUTOPILOT_VERSION"): 0.0,
-}
 
 
 class Link:
@@ -109,13 +75,13 @@ class Link:
             return None
         return stream.interval_us or -1
 
-    def due(self, now_us: int, period_us: int) -> list[int]:
+    def due(self, now_us: int, period_us: int) -> Sequence[int]:
         """Give the messages to send now; period_us is the time between two states.
 
         An interval of at most that period gives every state. A longer one keeps its rate on average, whatever the grid.
         """
         if now_us < self._next_us:
-            return [] if self.quiet else self._every_state.copy()
+            return self._every_state
         self._every_state = []
         self._next_us = now_us + _INT32_MAX
         ids: list[int] = []

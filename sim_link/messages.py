@@ -7,7 +7,7 @@ ones pymavlink objects.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from . import codec
@@ -23,16 +23,6 @@ from .vehicle_file import VehicleFile
 _LOCAL_NED = 1
 _ESTIMATOR_AUTOPILOT = 8
 _STANDARD_G = 9.80665
-_SENSORS = (
-    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
-    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
-    | mavlink.MAV_SYS_STATUS_SENSOR_GPS
-    | mavlink.MAV_SYS_STATUS_AHRS
-    | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
-    | mavlink.MAV_SYS_STATUS_PREARM_CHECK
-)
 _ESTIMATOR_FLAGS = 1 | 2 | 4 | 8 | 16 | 32 | 64
 """Attitude, velocity and position (horizontal relative and absolute, vertical absolute and above ground) are good."""
 _CAPABILITIES = (
@@ -70,7 +60,8 @@ class Telemetry:
         self._instance = instance
         self._estimate = now
         self._t_us = now.t_us
-        self._rates: Vec3 = (0.0, 0.0, 0.0)
+        self.rates: Vec3 = (0.0, 0.0, 0.0)
+        """Body rates that the rate loop follows [rad/s]."""
         self._covariances = self._pack_covariances(vehicle)
         self.reset_counter = 0
         """Of the estimator: any change tells receivers to start their filters anew."""
@@ -81,7 +72,6 @@ class Telemetry:
             codec.ID_LOCAL_POSITION_NED: self.local_position,
             codec.ID_GLOBAL_POSITION_INT: self.global_position,
             codec.ID_ATTITUDE_TARGET: self.attitude_target,
-            mavlink.MAVLINK_MSG_ID_SYS_STATUS: self.sys_status,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self.extended_sys_state,
             mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self.estimator_status,
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self.home_position,
@@ -93,7 +83,11 @@ class Telemetry:
         """Take over the state of a tick; `rates`: the body rates that the rate loop follows [rad/s]."""
         self._t_us = t_us
         self._estimate = estimate
-        self._rates = rates
+        self.rates = rates
+
+    def add(self, builders: Mapping[int, Callable[[], Payload | None]]) -> None:
+        """Take in messages that are built elsewhere."""
+        self._builders.update(builders)
 
     def knows(self, msg_id: int) -> bool:
         """Tell whether the vehicle has such a message."""
@@ -117,9 +111,9 @@ class Telemetry:
     def odometry(self) -> bytes:
         """ODOMETRY: velocity is NED although PX4 could name a body frame; time_usec is the sample's."""
         t_us, p, v, q, w = self._estimate
-        head = codec.ODOMETRY_HEAD.pack(t_us, *p, *q, *v, *w)
-        tail = codec.ODOMETRY_TAIL.pack(_LOCAL_NED, _LOCAL_NED, self.reset_counter, _ESTIMATOR_AUTOPILOT, 0)
-        return head + self._covariances + tail
+        return codec.ODOMETRY.pack(
+            t_us, *p, *q, *v, *w, self._covariances, _LOCAL_NED, _LOCAL_NED, self.reset_counter, _ESTIMATOR_AUTOPILOT, 0
+        )
 
     def attitude_quaternion(self) -> bytes:
         """ATTITUDE_QUATERNION, stamped with the sample's time."""
@@ -157,8 +151,8 @@ class Telemetry:
         if last is None:
             if not self._autopilot.armed:
                 return None
-            return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, 0.0, 0.0, 0.0, 0.0, *self._rates, 0.0, 0)
-        return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, *last.q, *self._rates, abs(last.thrust), 0)
+            return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, 0.0, 0.0, 0.0, 0.0, *self.rates, 0.0, 0)
+        return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, *last.q, *self.rates, abs(last.thrust), 0)
 
     def heartbeat(self) -> Any:
         """HEARTBEAT."""
@@ -183,14 +177,6 @@ class Telemetry:
         if autopilot.armed:
             return int(mavlink.MAV_STATE_ACTIVE)
         return int(mavlink.MAV_STATE_STANDBY)
-
-    def sys_status(self) -> Any:
-        """SYS_STATUS: every sensor is well; PREARM_CHECK says whether arming would be allowed. The battery is ideal."""
-        ready = self._autopilot.armed or self._autopilot.ready_to_arm
-        health = _SENSORS if ready else _SENSORS & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
-        return mavlink.MAVLink_sys_status_message(
-            _SENSORS, _SENSORS, health, 100, 16200, -1, 0, 0, 0, 0, 0, 0, 100, 0, 0, 0
-        )
 
     def extended_sys_state(self) -> Any:
         """EXTENDED_SYS_STATE: landed state."""
@@ -229,7 +215,9 @@ class Telemetry:
     def current_mode(self) -> Any:
         """CURRENT_MODE: what is flown, and what was asked for."""
         autopilot = self._autopilot
-        return mavlink.MAVLink_current_mode_message(0, autopilot.mode.custom_mode, autopilot.intended.custom_mode)
+        return mavlink.MAVLink_current_mode_message(
+            autopilot.mode.standard, autopilot.mode.custom_mode, autopilot.intended.custom_mode
+        )
 
     def autopilot_version(self) -> Any:
         """AUTOPILOT_VERSION: the version tells whether message 139 is obeyed, and so does the capability of old."""

@@ -32,22 +32,24 @@ class _Row(NamedTuple):
     """MAV_MODE_FLAG bits without the armed bit."""
     needs_sticks: bool
     can_arm: bool
+    standard: int = 0
+    """MAV_STANDARD_MODE; 0: none."""
 
 
 class Mode(Enum):
     """The modes that this vehicle knows. `can_arm` follows PX4's mode_requirements.cpp."""
 
     MANUAL = _Row("Manual", MAIN_MANUAL, 0, FLAG_MANUAL_INPUT | FLAG_STABILIZE, True, True)
-    ALTITUDE = _Row("Altitude", MAIN_ALTCTL, 0, FLAG_MANUAL_INPUT | FLAG_STABILIZE, True, True)
-    POSITION = _Row("Position", MAIN_POSCTL, 0, FLAG_MANUAL_INPUT | FLAG_STABILIZE | FLAG_GUIDED, True, True)
+    ALTITUDE = _Row("Altitude", MAIN_ALTCTL, 0, FLAG_MANUAL_INPUT | FLAG_STABILIZE, True, True, 4)
+    POSITION = _Row("Position", MAIN_POSCTL, 0, FLAG_MANUAL_INPUT | FLAG_STABILIZE | FLAG_GUIDED, True, True, 1)
     ACRO = _Row("Acro", MAIN_ACRO, 0, FLAG_MANUAL_INPUT, True, True)
     STABILIZED = _Row("Stabilized", MAIN_STABILIZED, 0, FLAG_MANUAL_INPUT | FLAG_STABILIZE, True, True)
     OFFBOARD = _Row("Offboard", MAIN_OFFBOARD, 0, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, True)
-    TAKEOFF = _Row("Takeoff", MAIN_AUTO, 2, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, True)
+    TAKEOFF = _Row("Takeoff", MAIN_AUTO, 2, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, True, 8)
     HOLD = _Row("Hold", MAIN_AUTO, 3, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, True)
-    MISSION = _Row("Mission", MAIN_AUTO, 4, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, True)
-    RETURN = _Row("Return", MAIN_AUTO, 5, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, False)
-    LAND = _Row("Land", MAIN_AUTO, 6, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, False)
+    MISSION = _Row("Mission", MAIN_AUTO, 4, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, True, 6)
+    RETURN = _Row("Return", MAIN_AUTO, 5, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, False, 5)
+    LAND = _Row("Land", MAIN_AUTO, 6, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, False, 7)
     TERMINATION = _Row("Termination", MAIN_TERMINATION, 0, 0, False, False)
 
     @property
@@ -74,6 +76,21 @@ class Mode(Enum):
     def can_arm(self) -> bool:
         """Whether the vehicle may be armed while it is selected."""
         return self.value.can_arm
+
+    @property
+    def standard(self) -> int:
+        """MAV_STANDARD_MODE; 0: none."""
+        return self.value.standard
+
+
+def available_modes() -> list[Mode]:
+    """Give the modes that can be chosen, in the order of AVAILABLE_MODES."""
+    return [mode for mode in Mode if mode is not Mode.TERMINATION]
+
+
+def from_standard_mode(number: int | None) -> Mode | None:
+    """Find the mode of a MAV_STANDARD_MODE."""
+    return next((mode for mode in Mode if number and mode.standard == number), None)
 
 
 _BY_NUMBERS = {(mode.value.main, mode.value.sub): mode for mode in Mode}

@@ -11,8 +11,11 @@ from collections import deque
 from typing import NamedTuple
 
 from .codec import AUTOPILOT_COMPONENT, ActuatorControls, AttitudeTarget
+from .geodesy import HOME_ALTITUDE_M, local_position
 from .inner_loops import ATTITUDE, RATES, STOPPED, TORQUE, Setpoint
 from .parameters import Parameters
+from .position_loop import PositionSetpoint
+from .rotation import Quat, Vec3, rotate, yaw_of
 
 ROLL_RATE_IGNORE = 1
 PITCH_RATE_IGNORE = 2
@@ -21,12 +24,42 @@ THRUST_BODY_SET = 32
 THROTTLE_IGNORE = 64
 ATTITUDE_IGNORE = 128
 
+FORCE_SET = 512
+YAW_IGNORE = 1024
+YAW_RATE_TARGET_IGNORE = 2048
+FRAME_LOCAL_NED, FRAME_BODY_NED = 1, 8
+FRAME_GLOBAL_INT, FRAME_RELATIVE_INT, FRAME_TERRAIN_INT = 5, 6, 11
+
 # MAV_TYPEs whose scalar thrust PX4 points along -z: quad, coaxial, helicopter, hexa, octo, tri.
 # Any other, 0 (generic, PX4's default) included, leaves the thrust at zero without a word.
 _SCALAR_THRUST_TYPES = frozenset((2, 3, 4, 13, 14, 15))
+TRAJECTORY = -1
+"""What is followed when a position, velocity or acceleration came; the inner loops then get an attitude."""
+_POSITION, _VELOCITY, _ACCELERATION = 1, 8, 64
+"""Lowest of the three ignore bits of each vector."""
+_KEPT_US = 200_000
+"""So long a trajectory setpoint that the position controller cannot fly leaves the last good one in force."""
 _REEVALUATION_US = 500_000
 _NO_RATES = (0.0, 0.0, 0.0)
 _LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+_NOTHING = (math.nan, math.nan, math.nan)
+
+
+class PositionTarget(NamedTuple):
+    """SET_POSITION_TARGET_LOCAL_NED (84) or _GLOBAL_INT (86) as received; nothing is checked but the length."""
+
+    type_mask: int
+    target_system: int
+    target_component: int
+    frame: int
+    p: Vec3
+    """Local NED [m]; or latitude and longitude [deg] and altitude [m]."""
+    v: Vec3
+    a: Vec3
+    yaw: float
+    yaw_rate: float
 
 
 class Order(NamedTuple):
@@ -55,10 +88,14 @@ class Offboard:
         self._follows = STOPPED
         self._evaluated_us = 0
         self._delay_us = delay_us
-        self._under_way: deque[tuple[int, Setpoint]] = deque()
+        self._under_way: deque[tuple[int, Setpoint | PositionSetpoint]] = deque()
         self._attitude: Setpoint | None = None
         self._rates: Setpoint | None = None
         self._torque: Setpoint | None = None
+        self._trajectory: PositionSetpoint | None = None
+        self._trajectory_us = 0
+        self._flyable: PositionSetpoint | None = None
+        self._flyable_us = 0
         self._attitude_fresh = False
         self._rates_fresh = False
         self._torque_fresh = False
@@ -72,7 +109,12 @@ class Offboard:
     @property
     def controls_attitude(self) -> bool:
         """Whether the attitude controller runs: PX4's failure detector looks at the tilt only then."""
-        return self._follows == ATTITUDE
+        return self._follows in (ATTITUDE, TRAJECTORY)
+
+    @property
+    def follows_trajectory(self) -> bool:
+        """Whether the position controller is in charge."""
+        return self._follows == TRAJECTORY
 
     def take_attitude_target(self, message: AttitudeTarget, now_us: int, active: bool) -> bool:
         """Take a SET_ATTITUDE_TARGET; `active`: the vehicle is in OFFBOARD. Returns whether it was accepted.
@@ -119,10 +161,89 @@ class Offboard:
             self._publish(Setpoint(TORQUE, thrust, _NO_RATES, _LEVEL, math.nan, (roll, pitch, yaw)), now_us)
         return True
 
+    def take_position_target(self, message: PositionTarget, now_us: int, active: bool, q: Quat) -> str | None:
+        """Take a SET_POSITION_TARGET_LOCAL_NED at the attitude q. Returns what is wrong with it, if anything is."""
+        if not self._is_for_us(message.target_system, message.target_component):
+            return None
+        mask = message.type_mask
+        if message.frame == FRAME_LOCAL_NED:
+            p = _given(message.p, mask, _POSITION)
+            v = _given(message.v, mask, _VELOCITY)
+            a = _given(message.a, mask, _ACCELERATION)
+        elif message.frame == FRAME_BODY_NED:
+            p = _NOTHING
+            v = _whole_vector(message.v, mask, _VELOCITY)
+            yaw = yaw_of(q)
+            north, east = math.cos(yaw), math.sin(yaw)
+            v = (v[0] * north - v[1] * east, v[0] * east + v[1] * north, v[2])
+            a = rotate(q, _whole_vector(message.a, mask, _ACCELERATION))
+        else:
+            self.dropped += 1
+            return f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {message.frame} unsupported"
+        return self._take_trajectory(message, p, v, a, now_us, active)
+
+    def take_global_target(self, message: PositionTarget, now_us: int, active: bool, home: Vec3) -> str | None:
+        """Take a SET_POSITION_TARGET_GLOBAL_INT. Returns what is wrong with it, if anything is."""
+        if not self._is_for_us(message.target_system, message.target_component):
+            return None
+        if message.frame not in (FRAME_GLOBAL_INT, FRAME_RELATIVE_INT, FRAME_TERRAIN_INT):
+            self.dropped += 1
+            return f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {message.frame}"
+        p = _NOTHING
+        if not message.type_mask & 7:
+            latitude, longitude, altitude_m = message.p
+            north, east, down = local_position(latitude, longitude, altitude_m)
+            if message.frame == FRAME_RELATIVE_INT:
+                # As PX4 computes it: wrong by twice the height of home above the local origin.
+                down = (HOME_ALTITUDE_M - home[2]) - altitude_m - HOME_ALTITUDE_M
+            elif message.frame == FRAME_TERRAIN_INT:
+                down = -altitude_m
+            p = (north, east, down)
+        v = _given(message.v, message.type_mask, _VELOCITY)
+        a = _given(message.a, message.type_mask, _ACCELERATION)
+        return self._take_trajectory(message, p, v, a, now_us, active)
+
+    def _take_trajectory(
+        self, message: PositionTarget, p: Vec3, v: Vec3, a: Vec3, now_us: int, active: bool
+    ) -> str | None:
+        mask = message.type_mask
+        if mask & FORCE_SET and not _is_empty(a):
+            self.dropped += 1
+            return "SET_POSITION_TARGET force not supported"
+        if _is_empty(p) and _is_empty(v) and _is_empty(a):
+            self.dropped += 1
+            return "SET_POSITION_TARGET invalid"
+        self.accepted += 1
+        self.seen_us = now_us
+        self._wants = TRAJECTORY
+        if active:
+            yaw = math.nan if mask & YAW_IGNORE else message.yaw
+            yaw_rate = math.nan if mask & YAW_RATE_TARGET_IGNORE else message.yaw_rate
+            self._publish(PositionSetpoint(p, v, a, yaw, yaw_rate), now_us)
+        return None
+
+    def trajectory(self, now_us: int) -> PositionSetpoint | None:
+        """Give what the position controller shall fly; None: nothing came yet.
+
+        A setpoint with an axis about which it says nothing, or with one of x and y alone, cannot be flown: the last
+        good one stays in force for a moment, then the vehicle stops.
+        """
+        self._deliver(now_us)
+        setpoint = self._trajectory
+        if setpoint is None:
+            return None
+        if _is_flyable(setpoint):
+            self._flyable, self._flyable_us = setpoint, now_us
+            return setpoint
+        if self._flyable is not None and now_us - self._flyable_us <= _KEPT_US:
+            return self._flyable
+        return PositionSetpoint(_NOTHING, (0.0, 0.0, 0.0), _NOTHING, math.nan, 0.0)
+
     def enter(self, now_us: int) -> None:
         """Start following: the vehicle has changed to OFFBOARD. What was held from earlier is not used again."""
         self._under_way.clear()
         self._attitude = self._rates = self._torque = None
+        self._trajectory = self._flyable = None
         self._attitude_fresh = self._rates_fresh = self._torque_fresh = False
         self.evaluate(now_us)
 
@@ -131,6 +252,17 @@ class Offboard:
         self._follows = self._wants
         self._evaluated_us = now_us
 
+    def _deliver(self, now_us: int) -> None:
+        """Let the delayed setpoints arrive whose time has come."""
+        while self._under_way and self._under_way[0][0] <= now_us:
+            self._arrive(self._under_way.popleft()[1])
+
+    def choose(self, now_us: int) -> None:
+        """Look at 2 Hz whether another controller shall be in charge."""
+        self._deliver(now_us)
+        if now_us - self._evaluated_us >= _REEVALUATION_US:
+            self.evaluate(now_us)
+
     def order(self, now_us: int, held: Setpoint) -> Order:
         """Give the setpoint for the next tick; `held`: what the loops follow already, and go on with when nothing came.
 
@@ -138,10 +270,7 @@ class Offboard:
         at (rates are followed, an attitude comes) or overwritten at once by the controller in charge (an attitude is
         followed, rates come: mask 0, or the time until the next evaluation).
         """
-        while self._under_way and self._under_way[0][0] <= now_us:
-            self._arrive(self._under_way.popleft()[1])
-        if now_us - self._evaluated_us >= _REEVALUATION_US:
-            self.evaluate(now_us)
+        self.choose(now_us)
         glimpse: Setpoint | None = None
         setpoint, fresh = self._rates, self._rates_fresh
         if self._follows == ATTITUDE:
@@ -159,16 +288,18 @@ class Offboard:
         """Vehicle time at which the next delayed setpoint reaches the loops."""
         return self._under_way[0][0] if self._under_way else None
 
-    def _publish(self, setpoint: Setpoint, now_us: int) -> None:
+    def _publish(self, setpoint: Setpoint | PositionSetpoint, now_us: int) -> None:
         """Send a setpoint on its way to the loops."""
         if self._delay_us > 0:
             self._under_way.append((now_us + self._delay_us, setpoint))
         else:
             self._arrive(setpoint)
 
-    def _arrive(self, setpoint: Setpoint) -> None:
+    def _arrive(self, setpoint: Setpoint | PositionSetpoint) -> None:
         """Put a setpoint on its topic."""
-        if setpoint.mode == ATTITUDE:
+        if isinstance(setpoint, PositionSetpoint):
+            self._trajectory = setpoint
+        elif setpoint.mode == ATTITUDE:
             self._attitude, self._attitude_fresh = setpoint, True
         elif setpoint.mode == RATES:
             self._rates, self._rates_fresh = setpoint, True
@@ -194,3 +325,26 @@ class Offboard:
         else:
             thrust = 0.0
         return 0.0 if self._legacy and math.isnan(thrust) else thrust
+
+
+def _given(vector: Vec3, mask: int, first_bit: int) -> Vec3:
+    """Give a vector with NaN on the axes that the mask ignores, or that hold no number."""
+    kept = [math.nan if mask & first_bit << k else value for k, value in enumerate(vector)]
+    x, y, z = (value if math.isfinite(value) else math.nan for value in kept)
+    return x, y, z
+
+
+def _whole_vector(vector: Vec3, mask: int, first_bit: int) -> Vec3:
+    """Give a vector, or nothing when the mask ignores any axis: so PX4 does in the body frame."""
+    return _NOTHING if mask & 7 * first_bit or not all(map(math.isfinite, vector)) else vector
+
+
+def _is_empty(vector: Vec3) -> bool:
+    return all(map(math.isnan, vector))
+
+
+def _is_flyable(setpoint: PositionSetpoint) -> bool:
+    """Tell whether the position controller has something on every axis, and x only together with y."""
+    axes = zip(setpoint.p, setpoint.v, setpoint.a, strict=True)
+    complete = all(any(map(math.isfinite, axis)) for axis in axes)
+    return complete and all(math.isfinite(x) == math.isfinite(y) for x, y, _ in (setpoint.p, setpoint.v, setpoint.a))

@@ -1,7 +1,6 @@
-"""The parameters of the simulated autopilot: PX4's names, types and defaults.
+"""The parameters of the simulated autopilot: PX4's names, types and defaults (`parameter_set`).
 
-`DEFAULTS` is PX4's multicopter set as far as this vehicle obeys it or a companion reads it before a flight. Values are
-kept as the 32-bit types that MAVLink carries, so that what is read back is what was set.
+Values are kept as the 32-bit types that MAVLink carries, so that what is read back is what was set.
 """
 
 from __future__ import annotations
@@ -9,6 +8,8 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping
+
+from .parameter_set import DEFAULTS, NOT_IN_1_13, ONLY_IN_1_13, READ_ONLY
 
 INT32 = 6
 """MAV_PARAM_TYPE_INT32"""
@@ -18,116 +19,6 @@ UINT32 = 5
 """MAV_PARAM_TYPE_UINT32, of _HASH_CHECK only"""
 
 HASH_CHECK = "_HASH_CHECK"
-
-# An int literal makes an INT32, a float literal a REAL32.
-DEFAULTS: dict[str, int | float] = {
-    "CBRK_FLIGHTTERM": 121212,
-    "CBRK_SUPPLY_CHK": 0,
-    "COM_ARMABLE": 1,
-    "COM_ARM_WO_GPS": 1,
-    "COM_DISARM_LAND": 2.0,
-    "COM_DISARM_PRFLT": 10.0,
-    "COM_DLL_EXCEPT": 0,
-    "COM_DL_LOSS_T": 10,
-    "COM_FAIL_ACT_T": 5.0,
-    "COM_FLTMODE_BOOT": 4,
-    "COM_LOW_BAT_ACT": 0,
-    "COM_OBL_RC_ACT": 0,
-    "COM_OF_LOSS_T": 1.0,
-    "COM_POS_FS_ACT": 0,
-    "COM_POS_FS_EPH": 5.0,
-    "COM_QC_ACT": 0,
-    "COM_RCL_EXCEPT": 0,
-    "COM_RC_IN_MODE": 1,
-    "COM_RC_LOSS_T": 0.5,
-    "COM_SPOOLUP_TIME": 1.0,
-    "COM_VEL_FS_EVH": 1.0,
-    "EKF2_HGT_REF": 1,
-    "FD_ALT_LOSS": 0.0,
-    "FD_FAIL_P": 60,
-    "FD_FAIL_P_TTRI": 0.3,
-    "FD_FAIL_R": 60,
-    "FD_FAIL_R_TTRI": 0.3,
-    "GF_ACTION": 2,
-    "GF_MAX_HOR_DIST": 0.0,
-    "GF_MAX_VER_DIST": 0.0,
-    "GF_SOURCE": 0,
-    "IMU_DGYRO_CUTOFF": 20.0,
-    "IMU_GYRO_CUTOFF": 40.0,
-    "MAN_OVERRIDE_SPD": 1.0,
-    "MAV_COMP_ID": 1,
-    "MAV_FWDEXTSP": 1,
-    "MAV_SYS_ID": 1,
-    "MAV_TYPE": 2,
-    "MC_AIRMODE": 0,
-    "MC_BAT_SCALE_EN": 0,
-    "MC_PITCHRATE_D": 0.003,
-    "MC_PITCHRATE_FF": 0.0,
-    "MC_PITCHRATE_I": 0.2,
-    "MC_PITCHRATE_K": 1.0,
-    "MC_PITCHRATE_MAX": 220.0,
-    "MC_PITCHRATE_P": 0.15,
-    "MC_PITCH_P": 4.0,
-    "MC_REF_FF": 0.0,
-    "MC_REF_FF_MAX": 100.0,
-    "MC_REF_W_N": 50.0,
-    "MC_ROLLRATE_D": 0.003,
-    "MC_ROLLRATE_FF": 0.0,
-    "MC_ROLLRATE_I": 0.2,
-    "MC_ROLLRATE_K": 1.0,
-    "MC_ROLLRATE_MAX": 220.0,
-    "MC_ROLLRATE_P": 0.15,
-    "MC_ROLL_P": 4.0,
-    "MC_YAWRATE_D": 0.0,
-    "MC_YAWRATE_FF": 0.0,
-    "MC_YAWRATE_I": 0.1,
-    "MC_YAWRATE_K": 1.0,
-    "MC_YAWRATE_MAX": 200.0,
-    "MC_YAWRATE_P": 0.2,
-    "MC_YAW_P": 2.8,
-    "MC_YAW_WEIGHT": 0.4,
-    "MIS_TAKEOFF_ALT": 2.5,
-    "MPC_ACC_DOWN_MAX": 3.0,
-    "MPC_ACC_HOR": 3.0,
-    "MPC_ACC_HOR_MAX": 5.0,
-    "MPC_ACC_UP_MAX": 4.0,
-    "MPC_JERK_AUTO": 4.0,
-    "MPC_LAND_SPEED": 0.7,
-    "MPC_MANTHR_MIN": 0.08,
-    "MPC_THR_HOVER": 0.5,
-    "MPC_THR_MAX": 1.0,
-    "MPC_THR_MIN": 0.12,
-    "MPC_THR_XY_MARG": 0.3,
-    "MPC_TILTMAX_AIR": 45.0,
-    "MPC_TILTMAX_LND": 12.0,
-    "MPC_TKO_RAMP_T": 3.0,
-    "MPC_TKO_SPEED": 1.5,
-    "MPC_VELD_LP": 5.0,
-    "MPC_XY_CRUISE": 5.0,
-    "MPC_XY_P": 0.95,
-    "MPC_XY_VEL_D_ACC": 0.2,
-    "MPC_XY_VEL_I_ACC": 0.4,
-    "MPC_XY_VEL_MAX": 12.0,
-    "MPC_XY_VEL_P_ACC": 1.8,
-    "MPC_Z_P": 1.0,
-    "MPC_Z_VEL_D_ACC": 0.0,
-    "MPC_Z_VEL_I_ACC": 2.0,
-    "MPC_Z_VEL_MAX_DN": 1.5,
-    "MPC_Z_VEL_MAX_UP": 3.0,
-    "MPC_Z_VEL_P_ACC": 4.0,
-    "NAV_DLL_ACT": 0,
-    "NAV_RCL_ACT": 2,
-    "RTL_DESCEND_ALT": 10.0,
-    "RTL_LAND_DELAY": 0.0,
-    "RTL_RETURN_ALT": 30.0,
-    "SYS_AUTOSTART": 10016,
-    "SYS_FAILURE_EN": 1,
-    "SYS_HITL": 0,
-    "THR_MDL_FAC": 0.0,
-}
-
-_NOT_IN_1_13 = ("MAN_OVERRIDE_SPD", "MC_REF_FF", "MC_REF_FF_MAX", "MC_REF_W_N")
-_ONLY_IN_1_13: dict[str, int | float] = {"COM_OBC_LOSS_T": 5.0, "COM_RC_OVERRIDE": 1, "MPC_USE_HTE": 1}
 
 
 class ParameterError(ValueError):
@@ -152,9 +43,9 @@ class Parameters:
         """The version whose set this is."""
         values = dict(DEFAULTS)
         if px4 == "1.13":
-            for name in _NOT_IN_1_13:
+            for name in NOT_IN_1_13:
                 del values[name]
-            values |= _ONLY_IN_1_13
+            values |= ONLY_IN_1_13
         self._values = {name: _as_32_bit(values[name]) for name in sorted(values)}
         self._names = list(self._values)
         self._index = {name: index for index, name in enumerate(self._names)}
@@ -162,6 +53,7 @@ class Parameters:
         """Counts the changes, so that users of a value can cache it."""
         for name, value in (overrides or {}).items():
             self.set(name, value)
+        self._at_start = dict(self._values)
 
     def __len__(self) -> int:
         return len(self._names)
@@ -218,6 +110,12 @@ class Parameters:
             self._values[name] = _as_32_bit(float(value))
         self.version += 1
 
+    def reset(self) -> None:
+        """Bring back the values of the start, but for what is the vehicle file's (PREFLIGHT_STORAGE)."""
+        for name, value in self._at_start.items():
+            self._values[name] = value
+        self.version += 1
+
     def set_text(self, name: str, text: str) -> None:
         """Set a value written as text (a command line's NAME=VALUE).
 
@@ -237,7 +135,7 @@ class Parameters:
         """Set a value as PARAM_SET carries it: four little-endian bytes, and only with the right type.
 
         Raises:
-            ParameterError: there is no such parameter, or its type is another.
+            ParameterError: there is no such parameter, its type is another, or it is read-only.
         """
         if name not in self._values:
             raise ParameterError(ParameterError.DOES_NOT_EXIST, f"there is no parameter {name}")
@@ -245,6 +143,8 @@ class Parameters:
             raise ParameterError(
                 ParameterError.TYPE_MISMATCH, f"{name} is of MAVLink type {self.type_of(name)}, not {kind}"
             )
+        if name in READ_ONLY:
+            raise ParameterError(ParameterError.READ_ONLY, f"{name} is fixed by the vehicle file")
         self._values[name] = struct.unpack("<i" if kind == INT32 else "<f", value)[0]
         self.version += 1
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from .codec import ID_TIMESYNC, TIMESYNC, Frame, timesync
 from .link import Link
-from .truth_log import TruthLog
+from .truth_log import TruthLog, row
 from .udp import Address, UdpEndpoint
 from .vehicle import Vehicle
 
@@ -28,6 +28,10 @@ _SLICE_S = 0.1
 """Longest single wait, so that a stop is noticed."""
 _SPIN_S = 2.0e-4
 """Wall time for which an answer is polled for before the process sleeps: waking up takes longer than most answers."""
+_SPIN_NEXT_S = 3.0e-5
+"""The same once something of the companion has come: the rest follows closely."""
+_SPIN_REST_MAX = 127
+"""States for which it sleeps at once after polling was in vain time and again: the companion needs the processor."""
 _LATE_MAX_S = 0.25
 """Of lateness so much is caught up with; the rest is let go."""
 
@@ -102,7 +106,16 @@ class Peer:
         self._stopped = stopped
         self._notice = notice
         self._endpoints = [self.companion] if self.ground is None else [self.companion, self.ground]
+        self._companion_poll = select.poll()
+        self._companion_poll.register(self.companion.fileno(), select.POLLIN)
+        self._poll = select.poll()
+        for endpoint in self._endpoints:
+            self._poll.register(endpoint.fileno(), select.POLLIN)
         self._waiting: deque[tuple[list[Frame], Address]] = deque()
+        self._spin_vain = 0
+        """States for which sleeping at once is the better choice, when polling was in vain last."""
+        self._spin_rest = 0
+        """How many of them are left."""
         self._awaited_ns = -1
         self._answered = False
         self._started = not options.lockstep
@@ -125,21 +138,29 @@ class Peer:
 
     def step(self) -> None:
         """Advance by one state: move, send, then wait as the kind of time asks, acting on what is received."""
-        vehicle = self.vehicle
-        vehicle.tick()
-        self._ticked_s = time.monotonic()
-        if self.options.lockstep:
-            self._awaited_ns = vehicle.t_us * 1000
-            self._answered = False
-            vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._awaited_ns, 0, 0))
-        self._flush()
+        vehicle, log = self.vehicle, self._truth_log
+        vehicle.tick(self._send_state)
+        if vehicle.truth_outbox:
+            self._flush()
+        # The companion is at work now: what else there is to do costs nobody any time.
+        vehicle.look_ahead()
+        text = "" if log is None else row(vehicle.airframe.truth())
         over = True
         if self.synchronous:
             over = self._wait_for_answer()
         else:
             self._wait_for_time()
-        if self._truth_log is not None and over:
-            self._truth_log.write(vehicle.airframe.truth())
+        if log is not None and over:
+            log.add(text)
+
+    def _send_state(self, t_us: int) -> None:
+        """Send the messages of a state; in lockstep ask for the companion's answer to it."""
+        self._ticked_s = time.monotonic()
+        if self.options.lockstep:
+            self._awaited_ns = t_us * 1000
+            self._answered = False
+            self.vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._awaited_ns, 0, 0))
+        self._flush()
 
     def close(self) -> None:
         """Close the sockets and complete the truth file."""
@@ -161,7 +182,7 @@ class Peer:
                 self.vehicle.heartbeat()
                 self._flush()
             timeout_s = max(0.0, min(_SLICE_S, next_heartbeat_s - now_s))
-            if select.select(self._endpoints, (), (), timeout_s)[0]:
+            if self._poll.poll(timeout_s * 1e3):
                 self._serve_ground()
                 datagram = self.companion.receive()
                 if datagram is not None and datagram[0]:
@@ -179,8 +200,7 @@ class Peer:
         while self._waiting and not self._answered:
             self._act(*self._waiting.popleft())
         give_up_s = self._ticked_s + PATIENCE_S
-        while not self._answered and time.monotonic() < self._ticked_s + _SPIN_S:
-            self._read_companion()
+        self._spin_first()
         while not self._answered:
             left_s = give_up_s - time.monotonic()
             if left_s <= 0.0:
@@ -192,8 +212,34 @@ class Peer:
             self._serve(0.0 if stopped else min(left_s, _SLICE_S))
             if stopped and not self._answered:
                 return False
+            self._spin(_SPIN_NEXT_S)
         self._flush()
         return True
+
+    def _spin_first(self) -> None:
+        """Poll for the answer to the present state, unless that was in vain for the states before."""
+        if self._answered:
+            return
+        if self._spin_rest > 0:
+            self._spin_rest -= 1
+            return
+        self._spin(_SPIN_S)
+        self._spin_vain = 0 if self._answered else min(2 * self._spin_vain + 1, _SPIN_REST_MAX)
+        self._spin_rest = self._spin_vain
+
+    def _spin(self, limit_s: float) -> None:
+        """Poll for the answer for a time; each datagram extends it a little, but never beyond the patience."""
+        poll, clock = self._companion_poll.poll, time.monotonic
+        end_s = clock() + limit_s
+        give_up_s = self._ticked_s + PATIENCE_S
+        while not self._answered:
+            if poll(0):
+                datagram = self.companion.receive()
+                if datagram is not None:
+                    self._act(*datagram)
+                end_s = min(max(end_s, clock() + _SPIN_NEXT_S), give_up_s)
+            elif clock() > end_s:
+                return
 
     def _wait_for_time(self) -> None:
         """Act on what comes until the wall clock has caught up with the vehicle's."""
@@ -216,8 +262,8 @@ class Peer:
 
     def _serve(self, timeout_s: float) -> None:
         """Wait until something is received, and act on it."""
-        for endpoint in select.select(self._endpoints, (), (), max(0.0, timeout_s))[0]:
-            if endpoint is self.companion:
+        for descriptor, _ in self._poll.poll(max(0.0, timeout_s) * 1e3):
+            if descriptor == self.companion.fileno():
                 self._read_companion()
             else:
                 self._serve_ground()
@@ -277,7 +323,8 @@ class Peer:
         if vehicle.companion.outbox:
             self.companion.send(vehicle.companion.outbox)
         if self.ground is not None:
-            self.ground.send(vehicle.ground.outbox)
+            if vehicle.ground.outbox:
+                self.ground.send(vehicle.ground.outbox)
         else:
             vehicle.ground.outbox.clear()
         if self._truth is not None and vehicle.truth_outbox:

@@ -1,12 +1,13 @@
-"""What the vehicle answers: dispatch of received messages, the parameter protocol, mode and heartbeat messages.
+"""What the vehicle answers: dispatch of received messages, the parameter protocol, mode, stick and heartbeat messages.
 
-Commands are in `commands`. Nothing here knows sockets: a message comes with the link it came on, and answers go there.
+Commands are in `commands`, missions in `mission_protocol`. Nothing here knows sockets: a message comes with the link it
+came on, and answers go there.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from . import codec
 from .autopilot import Autopilot
@@ -14,7 +15,10 @@ from .codec import AUTOPILOT_COMPONENT, Decoder, Frame, mavlink
 from .commands import Commands
 from .link import Link
 from .messages import Telemetry
-from .modes import from_custom_mode
+from .mission_protocol import MissionProtocol
+from .missions import MISSION
+from .modes import Mode, from_custom_mode
+from .offboard import PositionTarget
 from .parameters import HASH_CHECK, UINT32, ParameterError, Parameters
 
 _PARAM_READ = struct.Struct("<hBB16s")
@@ -24,6 +28,14 @@ _PARAM_VALUE = struct.Struct("<4sHH16sB")
 _ID_PARAM_VALUE = 22
 _SET_MODE = struct.Struct("<IBB")
 _HEARTBEAT = struct.Struct("<IBBBBB")
+_LOCAL_TARGET = mavlink.MAVLink_set_position_target_local_ned_message.unpacker
+_GLOBAL_TARGET = mavlink.MAVLink_set_position_target_global_int_message.unpacker
+_MISSION_CURRENT = struct.Struct("<HHBBIII")
+"""seq, total, mission_state, mission_mode, and the opaque ids of mission, fence and rally points."""
+_PING = struct.Struct("<QIBB")
+_REACHED_PERIOD_US = 2_000_000
+_REACHED_REPEATS = 10
+"""PX4 reports an item that was reached again and again: its report may be lost."""
 _HASH_INDEX = 0xFFFF
 _NAME_LENGTH = 16
 
@@ -36,7 +48,16 @@ class Services:
         self._parameters = parameters
         self._system = system
         self._decoder = Decoder()
-        self._commands = Commands(autopilot, telemetry, system=system)
+        self._commands = Commands(autopilot, parameters, telemetry, system=system)
+        flight = autopilot.guidance.mission
+        self._missions = MissionProtocol(autopilot.plans, self._say, system=system, select=flight.select)
+        self._missions.current = lambda: flight.current
+        self._flight = flight
+        self._current = 0
+        self._plans_version = 0
+        self._reached: int | None = None
+        self._reached_left = 0
+        self._reached_us = 0
         self._handlers: dict[int, Callable[[Frame, Link, int], None]] = {
             codec.ID_SET_ATTITUDE_TARGET: self._attitude_target,
             codec.ID_SET_ACTUATOR_CONTROL_TARGET: self._actuator_controls,
@@ -48,13 +69,49 @@ class Services:
             codec.ID_PARAM_REQUEST_READ: self._parameter_read,
             codec.ID_PARAM_REQUEST_LIST: self._parameter_list,
             codec.ID_PARAM_SET: self._parameter_set,
+            mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: self._local_target,
+            mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: self._global_target,
+            mavlink.MAVLINK_MSG_ID_RC_CHANNELS_OVERRIDE: self._radio,
+            mavlink.MAVLINK_MSG_ID_PING: self._ping,
         }
+        self._handlers |= dict.fromkeys(self._missions.message_ids, self._mission)
 
     def handle(self, frame: Frame, link: Link, now_us: int) -> None:
         """Act on one message; one that this vehicle has no use for is passed over."""
         handler = self._handlers.get(frame.msg_id)
         if handler is not None:
             handler(frame, link, now_us)
+
+    def update(self, links: Iterable[Link], now_us: int) -> None:
+        """Go on with what takes time: mission transfers, and the reports of a mission's progress."""
+        self._missions.update(now_us)
+        flight = self._flight
+        version = self._autopilot.plans.versions[MISSION]
+        if version != self._plans_version or flight.current != self._current:
+            if version != self._plans_version:
+                self._reached, self._reached_left = None, 0
+            self._plans_version, self._current = version, flight.current
+            for link in links:
+                link.send_hot(mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, self.mission_current())
+        if flight.reached is not None:
+            self._reached, self._reached_left, self._reached_us = flight.reached, _REACHED_REPEATS + 1, now_us
+            flight.reached = None
+        if self._reached is not None and self._reached_left > 0 and now_us >= self._reached_us:
+            self._reached_left -= 1
+            self._reached_us = now_us + _REACHED_PERIOD_US
+            for link in links:
+                link.send(mavlink.MAVLink_mission_item_reached_message(self._reached))
+
+    def mission_current(self) -> bytes:
+        """MISSION_CURRENT, with the ids of the plans in force."""
+        flight, plans = self._flight, self._autopilot.plans
+        flying = 1 if self._autopilot.mode is Mode.MISSION else 2
+        total = len(flight.items) or 0xFFFF
+        ids = [plans.ids[kind] for kind in sorted(plans.ids)]
+        return _MISSION_CURRENT.pack(flight.current, total, flight.state, flying if flight.items else 0, *ids)
+
+    def _say(self, severity: int, sentence: str) -> None:
+        self._autopilot.texts.append((severity, sentence))
 
     def send_parameters(self, link: Link, count: int) -> None:
         """Go on with a parameter list that was asked for on a link."""
@@ -77,7 +134,42 @@ class Services:
     def _manual_control(self, frame: Frame, link: Link, now_us: int) -> None:
         message = self._decoder.message(frame)
         if message is not None and message.target == self._system:
-            self._autopilot.manual_control()
+            self._autopilot.manual_control(message.x, message.y, message.z, message.r)
+
+    def _radio(self, frame: Frame, link: Link, now_us: int) -> None:
+        """RC_CHANNELS_OVERRIDE: a radio; 0 and 65535 end the list of channels that are given."""
+        message = self._decoder.message(frame)
+        if message is None or message.target_system not in (0, self._system):
+            return
+        values = [getattr(message, f"chan{k}_raw") for k in range(1, 19)]
+        count = next((k for k, value in enumerate(values) if value in (0, 0xFFFF)), len(values))
+        self._autopilot.radio(tuple(values[:count]))
+
+    def _local_target(self, frame: Frame, link: Link, now_us: int) -> None:
+        """SET_POSITION_TARGET_LOCAL_NED."""
+        f = _LOCAL_TARGET.unpack(codec.padded(frame.payload, _LOCAL_TARGET.size))
+        self._autopilot.position_target(
+            PositionTarget(f[12], f[13], f[14], f[15], f[1:4], f[4:7], f[7:10], f[10], f[11])
+        )
+
+    def _global_target(self, frame: Frame, link: Link, now_us: int) -> None:
+        """SET_POSITION_TARGET_GLOBAL_INT."""
+        f = _GLOBAL_TARGET.unpack(codec.padded(frame.payload, _GLOBAL_TARGET.size))
+        place = (1e-7 * f[1], 1e-7 * f[2], f[3])
+        self._autopilot.position_target(
+            PositionTarget(f[12], f[13], f[14], f[15], place, f[4:7], f[7:10], f[10], f[11]), is_global=True
+        )
+
+    def _mission(self, frame: Frame, link: Link, now_us: int) -> None:
+        message = self._decoder.message(frame)
+        if message is not None:
+            self._missions.handle(frame, message, link, now_us)
+
+    def _ping(self, frame: Frame, link: Link, now_us: int) -> None:
+        """PING: a request to everybody is answered as it came."""
+        time_us, sequence, system, component = _PING.unpack(codec.padded(frame.payload, _PING.size))
+        if (system, component) == (0, 0):
+            link.send(mavlink.MAVLink_ping_message(time_us, sequence, frame.system, frame.component))
 
     def _set_mode(self, frame: Frame, link: Link, now_us: int) -> None:
         """SET_MODE (11): packed custom_mode, never acknowledged."""

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 
 from .guidance import Guidance
-from .inner_loops import ATTITUDE, RATES, Setpoint
-from .modes import Mode
+from .inner_loops import RATES, Setpoint
 from .parameters import Parameters
 from .physics import RigidState
-from .position_loop import PositionParameters, PositionState, initial_position_state, position_control
-from .rotation import Quat, yaw_of
+from .position_loop import (
+    PositionParameters,
+    PositionSetpoint,
+    PositionState,
+    initial_position_state,
+    position_control,
+)
 
 IDLE = Setpoint(RATES, 0.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), math.nan, (0.0, 0.0, 0.0))
 """Armed on the ground: rotors turning, no thrust."""
@@ -33,19 +37,41 @@ class Steering:
         self._values = PositionParameters()
         self._version = -1
         self._state: PositionState | None = None
+        self._ramp_s: float | None = None
+        self.target: PositionSetpoint | None = None
+        """What is flown, or was flown last."""
 
     def rest(self) -> None:
         """Forget: somebody else is in charge, and the controller begins anew."""
         self._state = None
+        self._ramp_s = None
 
-    def setpoint(self, guidance: Guidance, rigid: RigidState, dt_s: float) -> Setpoint:
+    def begin_takeoff(self) -> None:
+        """Let the climb speed grow from nothing: a trajectory takes the vehicle off."""
+        if self._ramp_s is None:
+            self._ramp_s = 0.0
+
+    def guided(self, guidance: Guidance, rigid: RigidState, dt_s: float) -> Setpoint:
         """Give the attitude setpoint of a flight task; dt_s is the time since the last call."""
+        return self.setpoint(guidance.setpoint(rigid.p, rigid.v, dt_s), rigid, dt_s)
+
+    def setpoint(self, target: PositionSetpoint, rigid: RigidState, dt_s: float) -> Setpoint:
+        """Give the attitude setpoint that flies `target`; dt_s is the time since the last call."""
         if self._version != self._parameters.version:
             self._version = self._parameters.version
             self._values = position_parameters(self._parameters)
         state = initial_position_state(rigid.v) if self._state is None else self._state
-        target = guidance.setpoint(rigid.p, rigid.v, dt_s)
-        setpoint, self._state = position_control(rigid.p, rigid.v, rigid.q, target, state, self._values, dt_s)
+        values = self._values
+        if self._ramp_s is not None:
+            self._ramp_s += dt_s
+            share = self._ramp_s / max(self._parameters.number("MPC_TKO_RAMP_T"), 1e-3)
+            if share < 1.0:
+                values = values._replace(MPC_Z_VEL_MAX_UP=share * values.MPC_Z_VEL_MAX_UP)
+                target = target._replace(a=(target.a[0], target.a[1], math.nan))
+            else:
+                self._ramp_s = None
+        self.target = target
+        setpoint, self._state = position_control(rigid.p, rigid.v, rigid.q, target, state, values, dt_s)
         return setpoint
 
 
@@ -53,17 +79,3 @@ def position_parameters(parameters: Parameters) -> PositionParameters:
     """Give the position controller's parameters, limited to what it can compute with."""
     names = PositionParameters._fields
     return PositionParameters(*(parameters.within(name, *_RANGES.get(name, (0.0, 1000.0))) for name in names))
-
-
-def centred(mode: Mode, q: Quat, parameters: Parameters) -> Setpoint:
-    """Give what centred sticks mean in Stabilized, Manual and Acro: level, or no rotation, at the hover thrust.
-
-    Nobody holds position or height then.
-    """
-    thrust = parameters.number("MPC_THR_HOVER")
-    if mode is Mode.ACRO:
-        return Setpoint(RATES, thrust, (0.0, 0.0, 0.0), q, math.nan, (0.0, 0.0, 0.0))
-    half = yaw_of(q) / 2.0
-    return Setpoint(
-        ATTITUDE, thrust, (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half)), math.nan, (0.0, 0.0, 0.0)
-    )

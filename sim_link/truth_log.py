@@ -17,6 +17,13 @@ _ROW = "%d.%06d" + ",%.10g" * (len(COLUMNS) - 1)
 _ROWS_HELD = 500
 
 
+def row(truth: Truth) -> str:
+    """Format one row."""
+    seconds, micros = divmod(truth.t_us, 1_000_000)
+    _, p, v, q, w, rotor_n, _, disturbance = truth
+    return _ROW % (seconds, micros, *p, *v, *q, *w, *disturbance, *rotor_n)
+
+
 class TruthLog:
     """A CSV file that is written in blocks; complete once closed."""
 
@@ -27,9 +34,11 @@ class TruthLog:
 
     def write(self, truth: Truth) -> None:
         """Add one row."""
-        seconds, micros = divmod(truth.t_us, 1_000_000)
-        _, p, v, q, w, rotor_n, _, disturbance = truth
-        self._rows.append(_ROW % (seconds, micros, *p, *v, *q, *w, *disturbance, *rotor_n))
+        self.add(row(truth))
+
+    def add(self, text: str) -> None:
+        """Add one row that is formatted already."""
+        self._rows.append(text)
         if len(self._rows) >= _ROWS_HELD:
             self._flush()
 

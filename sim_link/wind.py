@@ -126,6 +126,11 @@ class Wind:
             self._gusts = self._new_gusts(speed, turbulence)
         self.air_m_s = self._sum()
 
+    @property
+    def gusty(self) -> bool:
+        """Whether the air changes from one period to the next."""
+        return self._gusts is not None
+
     def advance(self) -> None:
         """Go one period on."""
         if self._gusts is None:

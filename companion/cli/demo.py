@@ -44,7 +44,7 @@ def run(
     from companion.accelerate import resolve
     from companion.config import load_flight
     from companion.errors import InputError
-    from companion.flight.bundled import PX4_VERSIONS, BundledVehicle
+    from companion.flight.bundled import PX4_VERSIONS, BundledVehicle, start_of
     from companion.flight.launch import control, prepare
     from companion.trajectory.load import embedded
 
@@ -58,6 +58,7 @@ def run(
         "world__seed": seed,
     }
     configured = embedded(load_flight(flight, adjustments(**changes)), time_scale)
+    start_of(configured)
     folder = prepare(configured, out)
     version = px4 or ("1.13" if configured.output.kind == "actuators" else "1.18")
     with BundledVehicle(configured, folder, px4=version, engine=engine, lockstep=not real_time) as bundled:

@@ -13,7 +13,7 @@ from typing import Any
 
 import tomlkit
 
-from companion.config import Flight
+from companion.config import Flight, Start
 from companion.errors import ExitCode, InputError, LinkError
 
 TRUTH_FILE = "truth.csv"
@@ -27,6 +27,17 @@ def free_udp_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def start_of(flight: Flight) -> Start:
+    """Where the vehicle waits.
+
+    Raises:
+        InputError: the flight does not say.
+    """
+    if flight.start is None:
+        raise InputError(f"flight {flight.name!r} has no [start]: the bundled vehicle waits at start.position_m")
+    return flight.start
 
 
 class BundledVehicle:
@@ -45,8 +56,7 @@ class BundledVehicle:
     """
 
     def __init__(self, flight: Flight, folder: Path, *, px4: str, engine: str, lockstep: bool) -> None:
-        if flight.start is None:
-            raise InputError(f"flight {flight.name!r} has no [start]: the bundled vehicle waits at start.position_m")
+        start = start_of(flight)
         self._port = free_udp_port()
         self.connection = f"udpin:127.0.0.1:{self._port}"
         """Where the companion listens for it."""
@@ -54,7 +64,7 @@ class BundledVehicle:
         vehicle_file.write_text(tomlkit.dumps(_plain(flight.vehicle.model_dump(exclude_none=True))), encoding="utf-8")
         self._command = [
             *(sys.executable, "-m", "sim_link", "run", "--vehicle", str(vehicle_file)),
-            *(f"--start={_joined(*flight.start.position_m, flight.start.yaw_deg)}", "--px4", px4, "--engine", engine),
+            *(f"--start={_joined(*start.position_m, start.yaw_deg)}", "--px4", px4, "--engine", engine),
             *(f"--force={_joined(*flight.world.force_n)}", f"--wind={_joined(*flight.world.wind_m_s)}"),
             *(f"--gravity-factor={flight.world.gravity_factor!r}", f"--turbulence={flight.world.turbulence!r}"),
             *("--seed", str(flight.world.seed), "--truth", str(folder / TRUTH_FILE)),

@@ -56,6 +56,8 @@ OFFBOARD_LOSS_S = 1.0
 PACE_STATES = 15
 PACE_WALL_S = 3.0
 """A vehicle in lockstep shows itself within so many states; without any, so long is waited for them."""
+LOCKSTEP_SPIN_S = 0.0005
+"""A vehicle in lockstep answers within this: sleeping would cost more than the wait. Elsewhere the loop sleeps."""
 HEARTBEAT_INTERVAL_S = 1.0
 LATE_SHARE = 0.2
 TILT_FOR_S = 0.2
@@ -225,7 +227,7 @@ class FlightLoop:
     # -- one turn -------------------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        for frame in self._wire.receive(self._wait_s()):
+        for frame in self._wire.receive(self._wait_s(), LOCKSTEP_SPIN_S if self._peer.paced else 0.0):
             self._on_frame(frame)
         if not self._peer.paced:
             self._answer_state()

@@ -84,18 +84,23 @@ class Wire:
         """
         return cls(open_transport(connection), system_id, component_id, tap, guard)
 
-    def receive(self, timeout_s: float) -> list[Frame]:
+    def receive(self, timeout_s: float, spin_s: float = 0.0) -> list[Frame]:
         """Wait for the link at most this long, then return every good frame that is there, in the order of arrival.
 
         An empty list may come early (garbage, foreign senders): the caller watches the clock itself. One call reads a
         bounded number of datagrams, so that a flood cannot keep it; what is left is there for the next call. A
         timeout is rounded up to milliseconds.
 
+        Args:
+            timeout_s: how long to wait for the first datagram.
+            spin_s: look without sleeping for this long first: an answer that is due in less is not worth going to sleep
+                for, which costs more than the wait itself. For a vehicle in lockstep.
+
         Raises:
             LinkError: the serial line is gone.
         """
         frames: list[Frame] = []
-        if not self._poll.poll(max(0.0, timeout_s) * 1e3):
+        if not self._spin(spin_s) and not self._poll.poll(max(0.0, timeout_s) * 1e3):
             return frames
         unknown: list[bytes] = []
         for _ in range(_READS_MAX):
@@ -114,6 +119,17 @@ class Wire:
         if self._tap is not None:
             self._report(frames, unknown)
         return frames
+
+    def _spin(self, spin_s: float) -> bool:
+        """Look for a datagram without sleeping; True when one is there."""
+        if spin_s <= 0.0:
+            return False
+        poll, now = self._poll.poll, time.monotonic_ns
+        end_ns = now() + int(spin_s * 1e9)
+        while now() < end_ns:
+            if poll(0):
+                return True
+        return False
 
     def _parse_datagram(
         self, data: bytes, address: Address | None, wall_ns: int, frames: list[Frame], unknown: list[bytes]

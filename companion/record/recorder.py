@@ -242,7 +242,8 @@ def main(arguments: list[str]) -> int:
     with socket.socket(fileno=int(arguments[0])) as link:
         link.setblocking(False)
         writer = _DiskWriter(log)
-        link.send(_READY)
+        with contextlib.suppress(OSError):  # the control process died meanwhile: the end of the pair follows
+            link.send(_READY)
         taken, dropped = _receive(link, writer, int(arguments[2]))
         writer.close()
         with contextlib.suppress(OSError):  # nobody listens when the control process died

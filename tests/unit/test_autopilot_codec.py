@@ -17,9 +17,9 @@ def covariance(value):
 
 
 def odometry_payload(reset, quality):
-    head = codec.ODOMETRY_HEAD.pack(ODOMETRY[0], *ODOMETRY[3:6], *ODOMETRY[6], *ODOMETRY[7:])
     matrices = codec.COVARIANCE.pack(*covariance(4e-6)) + codec.COVARIANCE.pack(*covariance(2.5e-5))
-    return head + matrices + codec.ODOMETRY_TAIL.pack(1, 1, reset, 8, quality)
+    numbers = (ODOMETRY[0], *ODOMETRY[3:6], *ODOMETRY[6], *ODOMETRY[7:])
+    return codec.ODOMETRY.pack(*numbers, matrices, 1, 1, reset, 8, quality)
 
 
 def cases():

@@ -133,7 +133,7 @@ def test_certify_refuses_with_the_figure_and_still_prints_all_of_them(
     assert found["eigenvalues"]["q_estimator_on"][0] < 0.0
     assert main(["certify", str(bad)]) == 3
     assert "REFUSED" in capsys.readouterr().out
-    assert main(["certify", str(bad), "--allow-uncertified"]) == 0
+    assert main(["certify", str(bad), "--allow-uncertified"]) == 2  # it exists for simulation only
 
 
 def test_uncertified_gains_can_be_simulated_when_asked_for(

@@ -61,7 +61,7 @@ class VirtualWire:
     def offboard_s(self) -> float:
         return -math.inf if self.offboard_us is None else (self.vehicle.t_us - self.offboard_us) * 1e-6
 
-    def receive(self, timeout_s: float) -> list[Frame]:
+    def receive(self, timeout_s: float, spin_s: float = 0.0) -> list[Frame]:
         if self.stall is not None and self.offboard_s >= self.stall[0]:
             self._advance_to(self.now_ns + int(self.stall[1] * 1e9))
             self.stall = None

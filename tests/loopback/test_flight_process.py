@@ -1,0 +1,207 @@
+"""The programs as processes: signals, kills, ports, and what is left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import tomlkit
+from flight_cases import HOVER, Stand, flight_data, make_flight
+
+from companion.errors import ExitCode
+from companion.flight.bundled import free_udp_port
+from sim_link.modes import Mode
+
+PATIENCE_S = 60.0
+
+
+class Command:
+    """A `companion` command as a process in a session of its own, like one in a terminal of its own."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "companion", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+
+    def __enter__(self) -> Command:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for pid in (*self.children(), self.process.pid):
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+        self.process.communicate()
+
+    def children(self, name: str = "") -> list[int]:
+        """Process ids of its children whose command line holds a name."""
+        found = []
+        for folder in Path("/proc").iterdir():
+            if not folder.name.isdigit():
+                continue
+            try:
+                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+                words = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:
+                continue
+            if parent == self.process.pid and name in words:
+                found.append(int(folder.name))
+        return found
+
+    @property
+    def control_pid(self) -> int:
+        (pid,) = self.children("companion.flight.process")
+        return pid
+
+    def ends(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, out, err
+
+
+def until(condition: Callable[[], object]) -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def fly(folder: Path, stand: Stand, duration_s: float, *options: str) -> Command:
+    """`companion fly` over a point, against a stand's vehicle."""
+    data = flight_data(trajectory=dict(HOVER) | {"duration_s": duration_s}, statistics_from_s=1.0)
+    path = folder / "flight.toml"
+    path.write_text(tomlkit.dumps(data))
+    trajectory = folder / "hover.toml"
+    trajectory.write_text(tomlkit.dumps({k: v for k, v in data["trajectory"].items() if k != "name"}))
+    connection = f"udpin:127.0.0.1:{stand.port}"
+    return Command(
+        *("fly", str(trajectory), "--flight", str(path), "--connect", connection),
+        *("--out", str(folder / "out"), "--engine", "python", *options),
+    )
+
+
+def test_killed_control_process(tmp_path: Path) -> None:
+    """The vehicle fails safe as its parameters say, and the ground side says what happened."""
+    wanted = {5: Mode.HOLD, 4: Mode.LAND}
+    with contextlib.ExitStack() as stack:
+        flights = []
+        for action in wanted:
+            folder = tmp_path / str(action)
+            folder.mkdir()
+            parameters = {"COM_OBL_RC_ACT": action, "COM_OF_LOSS_T": 0.5}
+            stand = stack.enter_context(Stand(make_flight(), folder, parameters=parameters))
+            flights.append((stand, stack.enter_context(fly(folder, stand, 600.0))))
+        for stand, command in flights:
+            until(lambda stand=stand: stand.offboard_s > 0.5)
+            os.kill(command.control_pid, signal.SIGKILL)
+        for (stand, command), mode in zip(flights, wanted.values(), strict=True):
+            code, _, err = command.ends()
+            until(lambda stand=stand: stand.mode is not Mode.OFFBOARD)
+            assert stand.mode is mode
+            assert stand.vehicle.autopilot.in_failsafe
+            assert stand.vehicle.t_us - stand.setpoints()[-1].t_us >= 500_000
+            assert code == ExitCode.INTERNAL
+            assert "ended by signal 9" in err
+            assert "Traceback" not in err
+
+
+def test_killed_ground_side(tmp_path: Path) -> None:
+    """The flight goes on to its end, and its results are there."""
+    with Stand(make_flight(), tmp_path) as stand, fly(tmp_path, stand, 3.0) as command:
+        until(lambda: stand.offboard_s > 0.5)
+        os.kill(command.process.pid, signal.SIGKILL)
+        summary_file = tmp_path / "out" / "summary.json"
+        until(summary_file.exists)
+        assert stand.mode is Mode.HOLD
+    summary = json.loads(summary_file.read_text())
+    assert summary["duration_s"] == pytest.approx(3.0, abs=0.02)
+    assert summary["verdict"] == "passed"
+    assert summary["ended"] == "the flight was completed: the vehicle is in Hold"
+    assert (tmp_path / "out" / "link.tlog").stat().st_size > 100_000
+
+
+def test_ctrl_c_in_flight(tmp_path: Path) -> None:
+    """Hold, then 130."""
+    with Stand(make_flight(), tmp_path) as stand, fly(tmp_path, stand, 600.0, "--json") as command:
+        until(lambda: stand.offboard_s > 0.5)
+        os.kill(command.process.pid, signal.SIGINT)
+        code, out, err = command.ends()
+        assert (stand.mode, stand.vehicle.autopilot.intended) == (Mode.HOLD, Mode.HOLD)
+        assert not stand.vehicle.autopilot.in_failsafe
+    assert code == ExitCode.INTERRUPTED
+    document = json.loads(out)
+    assert document["exit_code"] == ExitCode.INTERRUPTED
+    assert document["ended"] == "interrupted by the operator: the vehicle is in Hold"
+    assert "Traceback" not in err
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["verdict"].startswith("ended early")
+
+
+def test_ctrl_c_in_the_demo(tmp_path: Path) -> None:
+    """A terminal sends it to the whole process group: the vehicle outlives it until it is handed over, and nobody is
+    left behind."""
+    with Command("demo", "--out", str(tmp_path / "out"), "--engine", "python") as command:
+        lines = iter(command.process.stdout.readline, "")  # type: ignore[union-attr]
+        assert any("track: OFFBOARD confirmed" in line for line in lines)
+        started = command.children()
+        assert len(started) == 2
+        os.killpg(command.process.pid, signal.SIGINT)
+        code, out, err = command.ends()
+        assert command.children() == []
+    assert code == ExitCode.INTERRUPTED
+    assert "interrupted by the operator: the vehicle is in Hold" in out
+    assert "Traceback" not in err
+    assert all(not Path(f"/proc/{pid}").exists() for pid in started)
+    assert (tmp_path / "out" / "report.html").exists()
+
+
+def fly_to(port: int, folder: Path, *options: str) -> Command:
+    connection = f"udpin:127.0.0.1:{port}"
+    options = ("--connect", connection, "--out", str(folder), "--engine", "python", *options)
+    return Command("fly", "hover", "--vehicle", "paper", *options)
+
+
+def test_ctrl_c_before_anything_connects(tmp_path: Path) -> None:
+    """While the control process starts, and while it waits for a vehicle."""
+    with (
+        fly_to(free_udp_port(), tmp_path / "1", "--timeout", "60") as starting,
+        fly_to(free_udp_port(), tmp_path / "2", "--timeout", "60") as waiting,
+    ):
+        until(starting.children)
+        os.kill(starting.process.pid, signal.SIGINT)
+        until((tmp_path / "2" / "link.tlog").exists)
+        os.kill(waiting.process.pid, signal.SIGINT)
+        for command in (starting, waiting):
+            code, _, err = command.ends()
+            assert code == ExitCode.INTERRUPTED
+            assert "interrupted by the operator" in err
+            assert "Traceback" not in err
+
+
+def test_port_in_use_and_nobody_at_a_port(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        used, free = holder.getsockname()[1], free_udp_port()
+        with fly_to(used, tmp_path / "1") as held, fly_to(free, tmp_path / "2", "--timeout", "0.2", "--json") as alone:
+            code, _, err = held.ends()
+            assert code == ExitCode.LOST
+            last = err.splitlines()[-1]
+            assert f"port {used} on 127.0.0.1 is in use (process {os.getpid()} " in last
+            assert "stop that program" in last
+            code, out, err = alone.ends()
+            assert code == ExitCode.LOST
+            assert f"no vehicle was found: nothing came at udpin:127.0.0.1:{free} within 0.2 s" in err
+            assert "sim-link run" in err
+            assert json.loads(out)["exit_code"] == ExitCode.LOST

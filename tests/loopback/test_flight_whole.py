@@ -1,0 +1,231 @@
+"""Whole flights over UDP, what is refused before one, and that the same seed gives the same flight."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+
+import numpy as np
+import pytest
+from flight_cases import COMMAND_LONG, HOVER, INDOOR, Stand, make_flight
+
+from companion import accelerate
+from companion.errors import ExitCode
+from companion.flight import connect
+from companion.flight.bundled import free_udp_port
+from companion.flight.loop import FlightLoop
+from companion.flight.phases import PHASE_NAMES, Cause
+from companion.flight.tracker import kernels
+from companion.link.wire import Wire
+from companion.record.columns import COLUMNS
+from companion.record.flight_record import FlightRecord
+from companion.record.summary import without_wall_clock
+from companion.trajectory.load import of_flight
+from sim_link import codec
+from sim_link.codec import mavlink
+from sim_link.modes import Mode
+
+WALL_COLUMNS = ("state_age_ms", "step_us", "late")
+ARM, NAV_TAKEOFF, NAV_LAND = 400, 22, 21
+
+
+def test_from_the_ground_and_back(tmp_path) -> None:
+    """Take-off, a smooth join, the trajectory, a stop, a landing; every change of phase has its reason."""
+    trajectory = dict(INDOOR) | {"duration_s": 2.0}
+    flight = make_flight(trajectory=trajectory, takeoff_altitude_m=3.0, after="land")
+    with Stand(flight, tmp_path, start=None) as stand:
+        flown = stand.fly()
+        assert not stand.vehicle.autopilot.armed
+        assert stand.vehicle.autopilot.land.landed
+        assert stand.mode is Mode.LAND
+    assert (flown.cause, flown.code) == (Cause.COMPLETED, ExitCode.DONE)
+    assert flown.outcome.sentence.endswith("landed and disarmed")
+    assert flown.phases == ["connect", "preflight", "takeoff", "join", "track", "hold", "land"]
+    times = [phase.at_s for phase in flown.outcome.phases]
+    assert times == sorted(times)
+    assert all(len(phase.reason) > 10 for phase in flown.outcome.phases)
+    assert [line for line in flown.lines if line.startswith("takeoff: ")] == [
+        f"takeoff: {flown.outcome.phases[2].reason}"
+    ]
+    commands = [h.message.command for h in stand.heard if h.msg_id == COMMAND_LONG]
+    order = [commands.index(number) for number in (NAV_TAKEOFF, ARM, NAV_LAND)]
+    assert order == sorted(order)
+    # The reference's clock starts at the hold point, 3 m up, and the flight keeps to it.
+    track = flown.record.in_phase("track")
+    assert flown.summary["position_max_m"] < 0.1
+    assert flown.record.column("ref_d")[track][0] == pytest.approx(-3.0, abs=0.2)
+    join = flown.record.in_phase("join")
+    error = np.linalg.norm(flown.record.columns("error_n", "error_e", "error_d"), axis=1)
+    assert error[join].max() < 0.1
+    # The landing is the autopilot's: no setpoints any more.
+    land_us = flown.outcome.phases[-1].at_s * 1e6
+    assert max(h.t_us for h in stand.setpoints()) <= land_us + 50_000
+
+
+@pytest.mark.parametrize(
+    ("output", "px4", "mask"), [("attitude", "1.18", 3), ("rates", "1.13", 128), ("actuators", "1.13", None)]
+)
+def test_outputs(output: str, px4: str, mask: int | None, tmp_path) -> None:
+    flight = make_flight(output__kind=output, world__force_n=[1.0, 0.5, 0.0])
+    with Stand(flight, tmp_path, px4=px4) as stand:
+        flown = stand.fly()
+        assert stand.mode is Mode.HOLD
+    assert flown.cause is Cause.COMPLETED
+    assert flown.summary["position_max_m"] < 0.2
+    kinds = {h.msg_id for h in stand.setpoints()}
+    if mask is None:
+        assert kinds == {codec.ID_SET_ACTUATOR_CONTROL_TARGET}
+    else:
+        assert kinds == {codec.ID_SET_ATTITUDE_TARGET}
+        assert {h.message.type_mask for h in stand.setpoints()} == {mask}
+    # One setpoint per state, none repeated: their stamps all differ.
+    name = "time_boot_ms" if mask is not None else "time_usec"
+    stamps = [getattr(h.message, name) for h in stand.setpoints(-math.inf)]
+    assert len(stamps) == len(set(stamps)) > 400
+
+
+REFUSALS = {
+    "MAV_TYPE 0": (dict(parameters={"MAV_TYPE": 0}), {}, "MAV_TYPE is 0"),
+    "a failsafe that does nothing": (
+        dict(parameters={"COM_OBL_RC_ACT": 0, "NAV_RCL_ACT": 0}),
+        {},
+        "set COM_OBL_RC_ACT to 5",
+    ),
+    "actuators on 1.18": (dict(), dict(output__kind="actuators"), "since 1.14; use output rates"),
+    "few states": (dict(), {}, "ODOMETRY comes at 50 Hz, 80 Hz are required"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSALS)
+def test_refused_before_anything_moves(what: str, tmp_path) -> None:
+    options, changes, says = REFUSALS[what]
+    every_second = [0]
+
+    def thinned(stand, msg_id, raw):
+        every_second[0] += msg_id == codec.ID_ODOMETRY
+        return [] if msg_id == codec.ID_ODOMETRY and every_second[0] % 2 else [raw]
+
+    alter = thinned if what == "few states" else None
+    with Stand(make_flight(**changes), tmp_path, alter=alter, **options) as stand:
+        flown = stand.fly()
+        assert stand.mode is Mode.HOLD
+    assert (flown.cause, flown.code) == (Cause.REFUSED, ExitCode.REFUSED)
+    assert says in flown.outcome.sentence
+    assert flown.phases == ["connect", "preflight"]
+    assert stand.setpoints(-math.inf) == []
+    assert stand.mode_requests(-math.inf) == []
+
+
+def test_arming_denied(tmp_path) -> None:
+    """The autopilot's own words are the reason, and the take-off mode does not stay selected."""
+    with Stand(make_flight(), tmp_path, start=None, parameters={"COM_ARMABLE": 0}) as stand:
+        flown = stand.fly()
+        assert not stand.vehicle.autopilot.armed
+        assert stand.mode is Mode.HOLD
+    assert (flown.cause, flown.code) == (Cause.REFUSED, ExitCode.REFUSED)
+    assert "Arming denied: COM_ARMABLE is 0" in flown.outcome.sentence
+
+
+def engines() -> list[str]:
+    return ["python", "numba"] if accelerate.available() else ["python"]
+
+
+@pytest.mark.parametrize("engine", engines())
+def test_same_seed_same_flight(engine: str, tmp_path) -> None:
+    """Noise, gusts and all: to the last bit, but for what the wall clock says."""
+    flight = make_flight(trajectory=dict(HOVER) | {"duration_s": 0.5}, world__force_n=[2.0, 0.0, 0.0])
+    flights = []
+    for seed in (1, 1, 2) if engine == "python" else (1, 1):
+        with Stand(flight, tmp_path, seed=seed) as stand:
+            flights.append(stand.fly(engine=engine))
+    first, second, *others = flights
+    assert first.cause is Cause.COMPLETED
+    assert without_wall_clock(first.summary) == without_wall_clock(second.summary)
+    kept = [name for name in COLUMNS if name not in WALL_COLUMNS]
+    assert first.record.columns(*kept).tobytes() == second.record.columns(*kept).tobytes()
+    assert all(without_wall_clock(first.summary) != without_wall_clock(other.summary) for other in others)
+
+
+# ---- nobody there, or somebody else --------------------------------------------------------------------------------
+
+
+class Caller:
+    """Sends the same datagrams to a port every 20 ms, as somebody who is no vehicle of ours."""
+
+    def __init__(self, port: int, datagrams: list[bytes]) -> None:
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind(("127.0.0.1", 0))
+        self._port = port
+        self._datagrams = datagrams
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Caller:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join(5.0)
+        self._sock.close()
+
+    def _run(self) -> None:
+        while not self._ended.wait(0.02):
+            for datagram in self._datagrams:
+                self._sock.sendto(datagram, ("127.0.0.1", self._port))
+
+
+def heartbeat(system: int, component: int, kind: int, autopilot: int) -> bytes:
+    message = mavlink.MAVLink_heartbeat_message(kind, autopilot, 1, Mode.HOLD.custom_mode, 4, 3)
+    return codec.Encoder(system, component).cold(message)
+
+
+GROUND_STATION = heartbeat(255, 190, 6, 8)
+ARDUPILOT = heartbeat(1, 1, 2, 3)
+PX4 = heartbeat(1, 1, 2, 12)
+CALLERS = {
+    "nobody": ([], Cause.NO_VEHICLE, "nothing came at udpin:127.0.0.1:{port} within 0.4 s"),
+    "a ground station": ([GROUND_STATION], Cause.NO_VEHICLE, "none of them an autopilot's heartbeat"),
+    "another autopilot": ([GROUND_STATION, ARDUPILOT], Cause.REFUSED, "system 1 is not PX4 (MAV_AUTOPILOT 3)"),
+    "a link without states": ([PX4], Cause.NO_VEHICLE, "neither TIMESYNC nor ODOMETRY within 0.4 s"),
+}
+
+
+@pytest.mark.parametrize("who", CALLERS)
+def test_no_vehicle(who: str) -> None:
+    datagrams, cause, says = CALLERS[who]
+    flight = make_flight()
+    port = free_udp_port()
+    connection = f"udpin:127.0.0.1:{port}"
+    record = FlightRecord(0, PHASE_NAMES)
+    with Caller(port, datagrams), Wire.open(connection) as wire:
+        flying = FlightLoop(
+            *(flight, of_flight(flight), wire, record, kernels("python")),
+            connect_timeout_s=0.4,
+            connection=connection,
+        )
+        outcome = flying.run()
+    assert outcome.cause is cause
+    assert cause.value.exit_code == (ExitCode.LOST if cause is Cause.NO_VEHICLE else ExitCode.REFUSED)
+    assert says.format(port=port) in outcome.sentence
+    assert outcome.phases == []
+
+
+def test_vehicle_is_found_behind_a_louder_sender(tmp_path, monkeypatch) -> None:
+    """The link locks on to the first sender, but not for good when that one is no vehicle."""
+    monkeypatch.setattr(connect, "PEER_PATIENCE_NS", 100_000_000)
+    flight = make_flight(trajectory=dict(HOVER) | {"duration_s": 0.2})
+    with Stand(flight, tmp_path) as stand, Caller(stand.port, [GROUND_STATION]):
+        flown = stand.fly()
+    assert flown.cause is Cause.COMPLETED
+
+
+def test_companion_that_speaks_first(tmp_path) -> None:
+    """udpout: the vehicle knows of nobody until it is spoken to."""
+    flight = make_flight(trajectory=dict(HOVER) | {"duration_s": 0.2})
+    with Stand(flight, tmp_path, speaks_first=False) as stand:
+        record = FlightRecord(1000, PHASE_NAMES)
+        with Wire.open(f"udpout:127.0.0.1:{stand.peer.companion.port}") as wire:
+            outcome = FlightLoop(flight, of_flight(flight), wire, record, kernels("python")).run()
+    assert outcome.cause is Cause.COMPLETED

@@ -1,0 +1,83 @@
+"""Messages may go out before the vehicle has moved: the same bytes, only earlier; and how answers are awaited."""
+
+from __future__ import annotations
+
+import pytest
+
+from sim_link.codec import ID_ATTITUDE_TARGET, ID_ODOMETRY, frames
+from sim_link.peer import Peer, PeerOptions
+from sim_link.vehicle import Vehicle, VehicleOptions
+from sim_link.vehicle_file import load
+
+IN_AIR = ((0.0, 0.0, -20.0), 0.0)
+
+
+def in_air(**options: object) -> Vehicle:
+    v = Vehicle(VehicleOptions(vehicle=load("paper"), start=IN_AIR, engine="python", **options))  # type: ignore[arg-type]
+    v.companion.set_interval(ID_ODOMETRY, 1, v.t_us)
+    return v
+
+
+def sent(v: Vehicle, ticks: int) -> tuple[list[list[bytes]], int]:
+    """Return what each tick queued, and how many of them did so before the vehicle moved."""
+    out = []
+    early = []
+    for _ in range(ticks):
+        before = v.t_us
+
+        def queued(now_us: int, before: int = before) -> None:
+            assert now_us == before + v.period_us
+            early.append(v.t_us == before)
+
+        v.tick(queued)
+        out.append(list(v.companion.outbox))
+        v.companion.outbox.clear()
+        v.look_ahead()
+    assert len(early) == ticks
+    return out, sum(early)
+
+
+def test_messages_of_the_past_go_out_before_the_move_and_are_the_same() -> None:
+    usual, patient = in_air(), in_air()
+    patient._tell_the_past = lambda due: False  # type: ignore[method-assign]
+    ahead, early = sent(usual, 300)
+    after, late = sent(patient, 300)
+    assert ahead == after
+    assert early > 200
+    assert late == 0
+    assert usual.airframe.truth() == patient.airframe.truth()
+    assert all(any(frame.msg_id == ID_ODOMETRY for raw in tick for frame in frames(raw)) for tick in ahead)
+
+
+def test_messages_of_the_present_wait_for_the_move() -> None:
+    v = in_air()
+    v.companion.set_interval(ID_ATTITUDE_TARGET, 1, v.t_us)
+    v.tick()
+    out, early = sent(v, 20)
+    assert early == 0
+    assert all(any(frame.msg_id == ID_ATTITUDE_TARGET for raw in tick for frame in frames(raw)) for tick in out)
+
+
+def test_polling_in_vain_makes_room_for_the_companion(monkeypatch: pytest.MonkeyPatch) -> None:
+    peer = Peer(in_air(), PeerOptions(port=0, remote_port=0, lockstep=True))
+    try:
+        polls: list[int] = []
+        state = 0
+        answers = False
+
+        def spin(limit_s: float) -> None:
+            polls.append(state)
+            peer._answered = answers
+
+        monkeypatch.setattr(peer, "_spin", spin)
+        for state in range(12):  # noqa: B007
+            peer._answered = False
+            peer._spin_first()
+        assert polls == [0, 2, 6]
+        answers = True
+        for state in range(12, 20):  # noqa: B007
+            peer._answered = False
+            peer._spin_first()
+        assert polls[3:] == [14, 15, 16, 17, 18, 19]
+    finally:
+        peer.close()
