@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
+from .arming import arming_obstacle
 from .codec import ActuatorControls, AttitudeTarget
-from .failsafe import Action, Cause, Decision, Health, decide, fence_action
+from .failsafe import Action, Cause, Decision, Health, decide
 from .geofence import Geofence
 from .guidance import Guidance
 from .inner_loops import ATTITUDE, STOPPED_SETPOINT, Setpoint
@@ -19,12 +20,11 @@ from .manual_control import ManualInput
 from .missions import Plans
 from .modes import Mode
 from .offboard import Offboard, Order, PositionTarget
+from .orders import Orders
 from .parameters import Parameters
 from .physics import RigidState
 from .position_loop import PositionSetpoint
 from .rotation import Vec3, yaw_of
-from .steering import IDLE, Steering
-from .stick_flight import CENTRED, AttitudeSticks
 from .watch import DisarmTimer, TiltWatch
 
 HEALTH_PERIOD_US = 100_000
@@ -37,10 +37,6 @@ _LONG_AGO_US = 60_000_000
 
 EMERGENCY, CRITICAL, WARNING, NOTICE, INFO = 0, 2, 4, 5, 6
 """MAV_SEVERITY"""
-
-_VERTICAL_INTENT_M_S = 0.05
-"""Vertical speed that a trajectory must ask for to mean a takeoff or a landing."""
-_RATE_OR_LEVEL = (Mode.STABILIZED, Mode.MANUAL, Mode.ACRO)
 
 
 class Result(IntEnum):
@@ -105,13 +101,11 @@ class Autopilot:
         self._lost_us: dict[Cause, int] = {}
         self._disarm_timer = DisarmTimer(parameters)
         self._tilt = TiltWatch(parameters)
-        self._steering = Steering(parameters)
-        self._attitude_sticks = AttitudeSticks(parameters)
+        self._orders = Orders(parameters, self.offboard, self.guidance, self.land, self.sticks)
         self._fence_us = now_us
         self._breach: str | None = None
         self._fence_overruled = False
         self._home_is_set = False
-        self._offboard_takeoff = False
         self.guidance.enter(Mode.HOLD, rigid.p, rigid.v, yaw_of(rigid.q), rigid.p)
 
     # Requests
@@ -138,7 +132,7 @@ class Autopilot:
         """Arm, if the mode in charge allows it and what it needs is there."""
         if self.armed:
             return Result.ACCEPTED
-        reason = self._arming_obstacle()
+        reason = arming_obstacle(self)
         if reason is not None:
             self._say(CRITICAL, f"Arming denied: {reason}")
             return Result.TEMPORARILY_REJECTED
@@ -195,7 +189,7 @@ class Autopilot:
         """Say what stands in the way of arming (RUN_PREARM_CHECKS)."""
         if self.armed:
             return Result.TEMPORARILY_REJECTED
-        reason = self._arming_obstacle()
+        reason = arming_obstacle(self)
         if reason is not None:
             self._say(CRITICAL, f"Preflight Fail: {reason}")
         return Result.ACCEPTED
@@ -263,6 +257,11 @@ class Autopilot:
         return self._ground_us is not None and (self._now_us - self._ground_us) * 1e-6 <= limit_s
 
     @property
+    def offboard_ok(self) -> bool:
+        """Whether a companion's setpoints come, as it was at the last check."""
+        return self._offboard_ok
+
+    @property
     def in_failsafe(self) -> bool:
         """Whether a failsafe acts. One without an action does not count: PX4 shows nothing of it either."""
         return self.failsafe is not None and self.failsafe.action is not Action.NONE
@@ -270,7 +269,7 @@ class Autopilot:
     @property
     def position_setpoint(self) -> PositionSetpoint | None:
         """What the position controller flies, or flew last; None: nothing yet."""
-        return self._steering.target
+        return self._orders.target
 
     @property
     def breach(self) -> str | None:
@@ -278,14 +277,9 @@ class Autopilot:
         return self._breach
 
     @property
-    def arming_obstacle(self) -> str | None:
-        """Why arming would be denied; None: it would not."""
-        return self._arming_obstacle()
-
-    @property
     def ready_to_arm(self) -> bool:
         """Whether arming would be allowed now."""
-        return self._arming_obstacle() is None
+        return arming_obstacle(self) is None
 
     # Time
 
@@ -315,22 +309,20 @@ class Autopilot:
     def _watch(self, now_us: int, rigid: RigidState) -> None:
         """Run the land and tilt detectors and act on what they say."""
         thrust = self.held.thrust
-        trajectory = self.mode is Mode.OFFBOARD and self.offboard.follows_trajectory
-        climb_controlled = trajectory or (self.mode is not Mode.OFFBOARD and self.mode not in _RATE_OR_LEVEL)
-        descending = self._trajectory_goes(rigid.p, down=True) if trajectory else self.guidance.descending
+        climb_controlled = self._orders.controls_climb(self.mode)
         motion = Motion(
             rigid.v,
             rigid.w,
             0.0 if math.isnan(thrust) else thrust,
             climb_controlled,
-            climb_controlled and descending,
+            climb_controlled and self._orders.descends(self.mode, now_us, rigid.p),
             self.armed,
         )
         self.land.update(motion, now_us)
         if not self.armed:
             return
         self._took_off = self._took_off or not self.land.landed
-        self.guidance.observe(rigid.p, self.land.landed, self.sticks.now(now_us))
+        self.guidance.observe(rigid.p, self.land.landed, self.sticks.now(now_us), WATCH_PERIOD_US * 1e-6)
         self._follow_mission()
         if self.mode is Mode.TAKEOFF and self.guidance.takeoff_done:
             self.intended = Mode.HOLD
@@ -389,69 +381,9 @@ class Autopilot:
     def _order(self, rigid: RigidState, dt_s: float) -> Order:
         """Give the setpoint of the mode in charge."""
         if not self.armed or self.terminated:
-            order = Order(STOPPED_SETPOINT, False)
-        elif self.mode is Mode.OFFBOARD:
-            self.offboard.choose(self._now_us)
-            if self.offboard.follows_trajectory:
-                return self._trajectory_order(rigid, dt_s)
-            order = self.offboard.order(self._now_us, self.held)
-        elif self.mode in _RATE_OR_LEVEL:
-            order = self._stick_order(rigid, dt_s)
-        elif self._stays_on_ground():
-            order = Order(IDLE, False)
-        else:
-            return Order(self._steering.guided(self.guidance, rigid, dt_s), True)
-        self._steering.rest()
-        return order
-
-    def _stick_order(self, rigid: RigidState, dt_s: float) -> Order:
-        """Give what the sticks fly without the position controller; on the ground with the throttle up only."""
-        sticks = self.sticks.now(self._now_us) or CENTRED
-        if self.land.landed and sticks.throttle <= 0.0:
-            self._attitude_sticks.rest()
-            return Order(IDLE, True)
-        return Order(self._attitude_sticks.setpoint(self.mode, sticks, rigid.q, dt_s), True)
-
-    def _trajectory_order(self, rigid: RigidState, dt_s: float) -> Order:
-        """Give what a companion's position, velocity or acceleration flies."""
-        target = self.offboard.trajectory(self._now_us)
-        on_ground = self.land.landed or (self._offboard_takeoff and not self._spooled_up)
-        if target is None or (self.land.landed and not self._trajectory_goes(rigid.p, down=False)):
-            self._steering.rest()
-            return Order(IDLE if self.land.landed else self.held, False)
-        if on_ground:
-            self._offboard_takeoff = True
-            if not self._spooled_up:
-                self._steering.rest()
-                return Order(IDLE, False)
-            if self.land.landed:
-                self._steering.begin_takeoff()
-                self.land.lift()
-        self._offboard_takeoff = False
-        return Order(self._steering.setpoint(target, rigid, dt_s), True)
-
-    def _trajectory_goes(self, p: Vec3, *, down: bool) -> bool:
-        """Tell whether a companion's trajectory leads down, or up."""
-        target = self.offboard.trajectory(self._now_us)
-        if target is None:
-            return False
-        speed = 0.0 if math.isnan(target.v[2]) else target.v[2]
-        if not math.isnan(target.p[2]):
-            speed += self.parameters.number("MPC_Z_P") * (target.p[2] - p[2])
-        elif math.isnan(target.v[2]) and not math.isnan(target.a[2]):
-            speed = target.a[2]
-        return speed > _VERTICAL_INTENT_M_S if down else speed < -_VERTICAL_INTENT_M_S
-
-    @property
-    def _spooled_up(self) -> bool:
-        """Whether the rotors have had COM_SPOOLUP_TIME since arming."""
-        return (self._now_us - self._armed_us) * 1e-6 >= self.parameters.number("COM_SPOOLUP_TIME")
-
-    def _stays_on_ground(self) -> bool:
-        """Tell whether a mode that steers itself keeps the rotors idling."""
-        if self.guidance.wants_to_fly():
-            return not self._spooled_up
-        return self.land.landed or (self.guidance.descending and self.land.ground_contact)
+            return self._orders.nothing()
+        spooled_up = (self._now_us - self._armed_us) * 1e-6 >= self.parameters.number("COM_SPOOLUP_TIME")
+        return self._orders.give(self.mode, self._now_us, rigid, dt_s, self.held, spooled_up)
 
     # Failsafe and arming
 
@@ -517,28 +449,6 @@ class Autopilot:
         if mode is Mode.MISSION:
             return self.guidance.mission.can_run
         return self.sticks_ok or not mode.needs_sticks
-
-    def _arming_obstacle(self) -> str | None:
-        """Give the reason why arming is denied; None when it is not."""
-        if self.terminated:
-            return "flight is terminated"
-        if self.parameters.integer("COM_ARMABLE") == 0:
-            return "COM_ARMABLE is 0"
-        if not self.intended.can_arm:
-            return f"mode {self.intended.label} prevents it, switch to another one first"
-        if self.intended is Mode.OFFBOARD and not self._offboard_ok:
-            return "no offboard signal"
-        if self.intended is Mode.MISSION and not self.guidance.mission.can_run:
-            return "no valid mission"
-        if self.intended.needs_sticks and not self.sticks_ok:
-            return "no manual control input"
-        if not self.ground_ok:
-            return "no connection to the ground control station"
-        if self._breach is not None and fence_action(self.parameters) is not Action.NONE:
-            return f"geofence violation, {self._breach}"
-        if self.battery_charge > 1:
-            return "low battery"
-        return None
 
     def _disarm(self, sentence: str) -> None:
         """Stop the rotors."""

@@ -121,18 +121,14 @@ def run(
             engine=_choice(engine, _ENGINES, "--engine"),
             parameters=_parameters(param or [], px4),
         )
-        shift = instance if instance < _SITL_SECOND_RANGE else instance + 10_000
-        any_port = port == 0
-        peer_options = PeerOptions(
-            port=_port(14580 + shift if port is None else port, "--port"),
-            remote_port=_port(14540 + shift if remote_port is None else remote_port, "--remote-port"),
-            ground_port=_ground_port(ground, ground_port, 0 if any_port else 18570 + instance),
-            ground_remote_port=_port(ground_remote_port, "--ground-remote-port"),
-            truth_port=_port(19410 + instance if truth_port is None else truth_port, "--truth-port")
-            if truth_stream
-            else None,
+        peer_options = _peer_options(
+            instance,
+            companion=(port, remote_port),
+            ground=(ground_port, ground_remote_port) if ground else None,
+            truth_port=truth_port,
+            truth_stream=truth_stream,
             lockstep=lockstep,
-            speed=_number(speed, "--speed", above=0.0),
+            speed=speed,
         )
         if duration is not None:
             _number(duration, "--duration", above=0.0)
@@ -151,6 +147,32 @@ def run(
         peer.run(duration)
     finally:
         peer.close()
+
+
+def _peer_options(
+    instance: int,
+    *,
+    companion: tuple[int | None, int | None],
+    ground: tuple[int | None, int] | None,
+    truth_port: int | None,
+    truth_stream: bool,
+    lockstep: bool,
+    speed: float,
+) -> PeerOptions:
+    """Check ports and time; a port that is None is PX4's for the instance. `companion`, `ground`: own, spoken to."""
+    shift = instance if instance < _SITL_SECOND_RANGE else instance + 10_000
+    port, remote_port = companion
+    own_ground, remote_ground = ground or (None, 0)
+    ground_default = 0 if port == 0 else 18570 + instance
+    return PeerOptions(
+        port=_port_or(port, 14580 + shift, "--port"),
+        remote_port=_port_or(remote_port, 14540 + shift, "--remote-port"),
+        ground_port=_port_or(own_ground, ground_default, "--ground-port") if ground is not None else None,
+        ground_remote_port=_port_or(remote_ground, 0, "--ground-remote-port"),
+        truth_port=_port_or(truth_port, 19410 + instance, "--truth-port") if truth_stream else None,
+        lockstep=lockstep,
+        speed=_number(speed, "--speed", above=0.0),
+    )
 
 
 class _Stop:
@@ -266,14 +288,13 @@ def _choice(value: str, allowed: tuple[str, ...], option: str) -> str:
     return value
 
 
-def _port(number: int, option: str) -> int:
+def _port_or(number: int | None, default: int, option: str) -> int:
+    """Check a port; None is the default."""
+    if number is None:
+        return default
     if not 0 <= number <= 65535:
         raise InputError(f"{option} {number}: allowed are 0 to 65535")
     return number
-
-
-def _ground_port(wanted: bool, number: int | None, default: int) -> int | None:
-    return _port(default if number is None else number, "--ground-port") if wanted else None
 
 
 def _parameters(items: list[str], px4: str) -> dict[str, int | float]:

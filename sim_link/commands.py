@@ -11,7 +11,7 @@ from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, mavlink
 from .geodesy import HOME_ALTITUDE_M, local_position
 from .link import Link
 from .messages import Telemetry
-from .modes import FLAG_CUSTOM_MODE, Mode, available_modes, from_numbers, from_standard_mode
+from .modes import FLAG_CUSTOM_MODE, Mode, available_modes, from_base_mode, from_numbers, from_standard_mode
 from .parameters import Parameters
 from .rotation import Vec3
 
@@ -129,11 +129,16 @@ class Commands:
         return Result.UNSUPPORTED
 
     def _set_mode(self, command: Command) -> Result:
-        """DO_SET_MODE: param1 base mode with the custom bit, param2 main, param3 sub mode; not the packed number."""
+        """DO_SET_MODE: param1 base mode with the custom bit, param2 main, param3 sub mode; not the packed number.
+
+        Without the custom bit the other bits of the base mode choose.
+        """
         base, main, sub = command.whole(1), command.whole(2), command.whole(3)
         mode = None
-        if base is not None and base & FLAG_CUSTOM_MODE and main is not None:
-            mode = from_numbers(main, sub or 0)
+        if base is not None and base & FLAG_CUSTOM_MODE:
+            mode = None if main is None else from_numbers(main, sub or 0)
+        elif base is not None:
+            mode = from_base_mode(base)
         return Result.TEMPORARILY_REJECTED if mode is None else self._autopilot.set_mode(mode)
 
     def _takeoff(self, command: Command) -> Result:

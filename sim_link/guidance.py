@@ -188,9 +188,7 @@ class Guidance:
 
     def _fly_mission(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
         """Fly the mission's present leg."""
-        mission = self.mission
-        mission.update(p, self.landed, dt_s)
-        leg = mission.leg(p, self.home, self.landed)
+        leg = self.mission.leg(p, self.home, self.landed)
         if leg.kind in (Kind.NOTHING, Kind.RETURN):
             return self._hold(p, v, dt_s)
         if leg.kind is Kind.CLIMB:
@@ -217,9 +215,11 @@ class Guidance:
         """Whether the mission goes on with Return."""
         return self._mode is Mode.MISSION and self._mission_leg is Kind.RETURN
 
-    def observe(self, p: Vec3, landed: bool, sticks: Sticks | None) -> None:
-        """Take note of where the vehicle is, whether it stands, and of the sticks."""
+    def observe(self, p: Vec3, landed: bool, sticks: Sticks | None, dt_s: float) -> None:
+        """Take note of where the vehicle is, whether it stands, and of the sticks; dt_s: since the last time."""
         self._here, self.landed, self.sticks = p, landed, sticks
+        if self._mode is Mode.MISSION:
+            self.mission.update(p, landed, dt_s)
 
     def _landing_speed(self, p: Vec3) -> float:
         """Give the speed of a descent to home's height: fast while high."""

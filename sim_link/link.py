@@ -40,7 +40,9 @@ class Link:
         """Sends its heartbeat only, until somebody has spoken on it."""
         self._next_us = 0
         """Vehicle time before which nothing but the messages of every state is due."""
+        self._period_us = 0
         self._every_state: list[int] = []
+        self._now_and_then: list[tuple[int, Stream]] = []
         self.streams: dict[int, Stream] = {}
         for number, rate in rates_hz.items():
             interval = round(1e6 / rate) if rate > 0.0 else 0
@@ -82,24 +84,28 @@ class Link:
         """
         if now_us < self._next_us:
             return self._every_state
-        self._every_state = []
-        self._next_us = now_us + _INT32_MAX
-        ids: list[int] = []
-        for msg_id, stream in self.streams.items():
-            if stream.interval_us == 0 or (self.quiet and msg_id != ID_HEARTBEAT):
-                continue
-            if stream.interval_us <= period_us:
-                self._every_state.append(msg_id)
-            elif now_us < stream.due_us:
-                self._next_us = min(self._next_us, stream.due_us)
-                continue
-            else:
-                stream.due_us += stream.interval_us
-                if stream.due_us <= now_us:
-                    stream.due_us = now_us + stream.interval_us
-                self._next_us = min(self._next_us, stream.due_us)
-            ids.append(msg_id)
+        if self._next_us == 0 or period_us != self._period_us:
+            self._sort(period_us)
+        ids = self._every_state.copy()
+        next_us = now_us + _INT32_MAX
+        for msg_id, stream in self._now_and_then:
+            due_us = stream.due_us
+            if now_us >= due_us:
+                ids.append(msg_id)
+                due_us += stream.interval_us
+                if due_us <= now_us:
+                    due_us = now_us + stream.interval_us
+                stream.due_us = due_us
+            next_us = min(next_us, due_us)
+        self._next_us = next_us
         return ids
+
+    def _sort(self, period_us: int) -> None:
+        """Tell the messages of every state from those that are due now and then."""
+        self._period_us = period_us
+        sent = [(i, s) for i, s in self.streams.items() if s.interval_us and (i == ID_HEARTBEAT or not self.quiet)]
+        self._every_state = [msg_id for msg_id, stream in sent if stream.interval_us <= period_us]
+        self._now_and_then = [(msg_id, stream) for msg_id, stream in sent if stream.interval_us > period_us]
 
     def speak(self) -> None:
         """End the silence of a quiet link: somebody is there."""

@@ -42,6 +42,7 @@ _CAPABILITIES = (
 CAPABILITY_SET_ACTUATOR_TARGET = 1024
 """The bit that said that message 139 is obeyed; today's dialect calls it reserved."""
 _VERSIONS = {"1.18": (1, 18, 0), "1.13": (1, 13, 3)}
+_ATTITUDE = mavlink.MAVLink_attitude_message.unpacker
 _TEXT_LENGTH = 50
 _RELEASE = 255
 """FIRMWARE_VERSION_TYPE_OFFICIAL"""
@@ -69,6 +70,7 @@ class Telemetry:
             codec.ID_HEARTBEAT: self.heartbeat,
             codec.ID_ODOMETRY: self.odometry,
             codec.ID_ATTITUDE_QUATERNION: self.attitude_quaternion,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE: self.attitude,
             codec.ID_LOCAL_POSITION_NED: self.local_position,
             codec.ID_GLOBAL_POSITION_INT: self.global_position,
             codec.ID_ATTITUDE_TARGET: self.attitude_target,
@@ -119,6 +121,11 @@ class Telemetry:
         """ATTITUDE_QUATERNION, stamped with the sample's time."""
         e = self._estimate
         return codec.ATTITUDE_QUATERNION.pack(e.t_us // 1000, *e.q, *e.w, 0.0, 0.0, 0.0, 0.0)
+
+    def attitude(self) -> bytes:
+        """ATTITUDE: Euler angles."""
+        e = self._estimate
+        return bytes(_ATTITUDE.pack(e.t_us // 1000, *euler(e.q), *e.w))
 
     def local_position(self) -> bytes:
         """LOCAL_POSITION_NED: PX4 stamps it with the time of publication, not of the sample."""
@@ -258,6 +265,13 @@ def truth_payload(t_us: int, p: Vec3, v: Vec3, q: tuple[float, ...], w: Vec3, ac
         airspeed,
         *(_int16(1000.0 * x / _STANDARD_G) for x in acceleration),
     )
+
+
+def euler(q: tuple[float, float, float, float]) -> Vec3:
+    """Give roll, pitch and yaw [rad] of an attitude."""
+    w, x, y, z = q
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    return roll, math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x)))), yaw_of(q)
 
 
 def _int16(value: float) -> int:

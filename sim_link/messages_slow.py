@@ -17,7 +17,7 @@ from .estimator import Estimate
 from .geodesy import GEOID_M, HOME_ALTITUDE_M, global_position
 from .inner_loops import STOPPED
 from .manual_control import Sticks
-from .messages import truth_payload
+from .messages import euler, truth_payload
 from .outputs import commands, pulse_widths
 from .parameters import Parameters
 from .physics import RigidState
@@ -84,7 +84,6 @@ class SlowTelemetry:
         self.battery = Battery(parameters, vehicle.mass_kg)
         m = mavlink
         self.builders: dict[int, Callable[[], Payload | None]] = {
-            m.MAVLINK_MSG_ID_ATTITUDE: self.attitude,
             m.MAVLINK_MSG_ID_HIGHRES_IMU: self.highres_imu,
             m.MAVLINK_MSG_ID_SCALED_IMU: self.scaled_imu,
             m.MAVLINK_MSG_ID_SCALED_PRESSURE: self.scaled_pressure,
@@ -138,11 +137,6 @@ class SlowTelemetry:
         return pulse_widths(commands(self._vehicle, before, now, self._passed_s), self._autopilot.armed)
 
     # State
-
-    def attitude(self) -> bytes:
-        """ATTITUDE: Euler angles."""
-        e = self._estimate
-        return _pack("ATTITUDE", e.t_us // 1000, *_euler(e.q), *e.w)
 
     def vfr_hud(self) -> bytes:
         """VFR_HUD: there is no airspeed sensor."""
@@ -317,7 +311,7 @@ class SlowTelemetry:
         target = autopilot.position_setpoint
         if target is None or not autopilot.armed or autopilot.held.mode == STOPPED:
             return None
-        roll, pitch, yaw = (math.degrees(x) for x in _euler(autopilot.held.q))
+        roll, pitch, yaw = (math.degrees(x) for x in euler(autopilot.held.q))
         north, east = _or_zero(target.p[0] - e.p[0]), _or_zero(target.p[1] - e.p[1])
         bearing = _whole(math.degrees(math.atan2(east, north)), -180, 180)
         distance = _whole(math.hypot(north, east), 0, _UINT16_MAX)
@@ -331,13 +325,6 @@ def _pack(name: str, *fields: float) -> bytes:
     """Pack a payload; fields in wire order."""
     cls = getattr(mavlink, f"MAVLink_{name.lower()}_message")
     return bytes(cls.unpacker.pack(*fields))
-
-
-def _euler(q: tuple[float, float, float, float]) -> Vec3:
-    """Give roll, pitch, yaw [rad]."""
-    w, x, y, z = q
-    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    return roll, math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x)))), yaw_of(q)
 
 
 def _or_zero(value: float) -> float:

@@ -88,6 +88,17 @@ def available_modes() -> list[Mode]:
     return [mode for mode in Mode if mode is not Mode.TERMINATION]
 
 
+def from_base_mode(flags: int) -> Mode | None:
+    """Find the mode of a base mode without custom mode, as PX4 does; None when it names none."""
+    if flags & FLAG_AUTO:
+        return Mode.MISSION
+    if not flags & FLAG_MANUAL_INPUT:
+        return None
+    if flags & FLAG_GUIDED:
+        return Mode.POSITION
+    return Mode.STABILIZED if flags & FLAG_STABILIZE else Mode.MANUAL
+
+
 def from_standard_mode(number: int | None) -> Mode | None:
     """Find the mode of a MAV_STANDARD_MODE."""
     return next((mode for mode in Mode if number and mode.standard == number), None)

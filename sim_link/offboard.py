@@ -217,8 +217,9 @@ class Offboard:
         self.seen_us = now_us
         self._wants = TRAJECTORY
         if active:
-            yaw = math.nan if mask & YAW_IGNORE else message.yaw
-            yaw_rate = math.nan if mask & YAW_RATE_TARGET_IGNORE else message.yaw_rate
+            yaw = math.nan if mask & YAW_IGNORE or not math.isfinite(message.yaw) else message.yaw
+            without_rate = mask & YAW_RATE_TARGET_IGNORE or not math.isfinite(message.yaw_rate)
+            yaw_rate = math.nan if without_rate else message.yaw_rate
             self._publish(PositionSetpoint(p, v, a, yaw, yaw_rate), now_us)
         return None
 

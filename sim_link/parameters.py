@@ -143,7 +143,7 @@ class Parameters:
             raise ParameterError(
                 ParameterError.TYPE_MISMATCH, f"{name} is of MAVLink type {self.type_of(name)}, not {kind}"
             )
-        if name in READ_ONLY:
+        if name in READ_ONLY and value != self.wire(name):
             raise ParameterError(ParameterError.READ_ONLY, f"{name} is fixed by the vehicle file")
         self._values[name] = struct.unpack("<i" if kind == INT32 else "<f", value)[0]
         self.version += 1

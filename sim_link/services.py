@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable
 
-from . import codec
+from . import codec, file_transfer
 from .autopilot import Autopilot
 from .codec import AUTOPILOT_COMPONENT, Decoder, Frame, mavlink
 from .commands import Commands
@@ -32,6 +32,8 @@ _LOCAL_TARGET = mavlink.MAVLink_set_position_target_local_ned_message.unpacker
 _GLOBAL_TARGET = mavlink.MAVLink_set_position_target_global_int_message.unpacker
 _MISSION_CURRENT = struct.Struct("<HHBBIII")
 """seq, total, mission_state, mission_mode, and the opaque ids of mission, fence and rally points."""
+_FTP_TARGET = 3
+"""Bytes of network, system and component before FTP's own payload."""
 _PING = struct.Struct("<QIBB")
 _REACHED_PERIOD_US = 2_000_000
 _REACHED_REPEATS = 10
@@ -73,6 +75,7 @@ class Services:
             mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: self._global_target,
             mavlink.MAVLINK_MSG_ID_RC_CHANNELS_OVERRIDE: self._radio,
             mavlink.MAVLINK_MSG_ID_PING: self._ping,
+            mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: self._file_transfer,
         }
         self._handlers |= dict.fromkeys(self._missions.message_ids, self._mission)
 
@@ -164,6 +167,14 @@ class Services:
         message = self._decoder.message(frame)
         if message is not None:
             self._missions.handle(frame, message, link, now_us)
+
+    def _file_transfer(self, frame: Frame, link: Link, now_us: int) -> None:
+        """FILE_TRANSFER_PROTOCOL: there are no files."""
+        payload = codec.padded(frame.payload, _FTP_TARGET + file_transfer.PAYLOAD_BYTES)
+        if payload[1] == self._system and payload[2] in (0, AUTOPILOT_COMPONENT):
+            content = file_transfer.answer(payload[_FTP_TARGET:])
+            head = bytes((0, frame.system, frame.component))
+            link.send_hot(mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL, head + content)
 
     def _ping(self, frame: Frame, link: Link, now_us: int) -> None:
         """PING: a request to everybody is answered as it came."""

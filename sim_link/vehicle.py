@@ -34,7 +34,7 @@ from .services import Services
 from .vehicle_file import VehicleFile
 from .wind import World
 
-ID_MISSION_CURRENT = 42
+ID_ATTITUDE, ID_MISSION_CURRENT = 30, 42
 PX4_VERSIONS = ("1.18", "1.13")
 _STANDARD_G = 9.80665
 _CONTROL_PERIOD_S = 0.01
@@ -44,7 +44,8 @@ _TRUTH_PERIOD_US = 40_000
 
 
 _OF_THE_PAST = frozenset(
-    (ID_HEARTBEAT, ID_TIMESYNC, ID_ODOMETRY, ID_ATTITUDE_QUATERNION, ID_LOCAL_POSITION_NED, ID_GLOBAL_POSITION_INT)
+    (ID_HEARTBEAT, ID_TIMESYNC, ID_ODOMETRY, ID_ATTITUDE, ID_ATTITUDE_QUATERNION, ID_LOCAL_POSITION_NED)
+    + (ID_GLOBAL_POSITION_INT,)
 )
 """Messages of what was estimated of the past, and of what the autopilot has decided already."""
 

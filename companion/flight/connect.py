@@ -14,7 +14,8 @@ AUTOPILOT_COMPONENT = 1
 WAIT_S = 0.1
 HEARTBEAT_INTERVAL_NS = 1_000_000_000
 PEER_PATIENCE_NS = 2_000_000_000
-"""A peer that sends MAVLink but no autopilot's heartbeat for this long is none; another sender may be the vehicle."""
+"""A peer that sends no autopilot's heartbeat for this long (they come every second) is no vehicle; then the other
+sender at the port, if there is one, gets its turn."""
 
 
 def send_heartbeat(wire: Wire) -> None:
@@ -64,7 +65,8 @@ def find_autopilot(wire: Wire, connection: str, timeout_s: float, interrupted: C
                 return system
         if wall_ns - peer_since_ns > PEER_PATIENCE_NS:
             peer_since_ns = wall_ns
-            wire.release_peer()
+            if wire.last_foreign is not None:
+                wire.peer, wire.last_foreign = wire.last_foreign, None
 
 
 def _autopilot_system(frame: Frame) -> int | None:

@@ -14,27 +14,26 @@ import math
 import time
 import traceback
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from companion.config import Flight
-from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, RateSetpoint, Setpoint, thrust_fraction
-from companion.control.types import GRAVITY_M_S2, State, Vec3
-from companion.control.vectors import axes
+from companion.control.output import Setpoint
+from companion.control.types import State
 from companion.errors import LinkError
 from companion.flight.clock import VehicleClock
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
 from companion.flight.course import at_rest
+from companion.flight.guards import Guards, coast_setpoint
 from companion.flight.last_resort import ask_for_hold
-from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Outcome, Phase
-from companion.flight.preflight import CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION
+from companion.flight.phases import Autopilot, Cause, FlightEnded, Outcome, Phase
+from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
 from companion.flight.tracker import Kernels, Tracker
-from companion.frames import tilt_from_quat, yaw_from_quat
+from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
 from companion.link.framing import Frame
-from companion.link.modes import Mode
 from companion.link.operations import Operations
 from companion.link.setpoint import SetpointSender, UnsendableSetpoint
 from companion.link.telemetry import StateRejection, Telemetry, VehicleState
@@ -60,7 +59,6 @@ LOCKSTEP_SPIN_S = 0.0005
 """A vehicle in lockstep answers within this: sleeping would cost more than the wait. Elsewhere the loop sleeps."""
 HEARTBEAT_INTERVAL_S = 1.0
 LATE_SHARE = 0.2
-TILT_FOR_S = 0.2
 IDLE_WAIT_S = 0.1
 BUSY_WAIT_S = 0.01
 PROGRESS_NS = 100_000_000
@@ -120,6 +118,8 @@ class FlightLoop:
         self._clock = VehicleClock(self._peer)
         self._autopilot = Autopilot()
         self._interrupted = False
+        self._met = False
+        """Whether an autopilot was heard: what depends on it exists from then on."""
         # the newest state that was not answered yet, with its arrival
         self._pending: VehicleState | None = None
         self._pending_wall_ns = 0
@@ -127,10 +127,11 @@ class FlightLoop:
         self._lost = 0
         self._last_state: VehicleState | None = None
         self._last_state_s = 0.0
+        self._last_arrival_ns = 0
         self._sent_us: int | None = None
         """Stamp of the last state that a setpoint went out for."""
         self._coasted = False
-        self._tilted_since_s: float | None = None
+        self._guards = Guards(flight.vehicle.limits)
         self._heartbeat_s = -math.inf
         self._progress_ns = 0
         self._requests: list[tuple[Timesync, Frame]] = []
@@ -161,7 +162,7 @@ class FlightLoop:
         finally:
             gc.enable()
             gc.unfreeze()
-        if not hasattr(self, "_sequence"):
+        if not self._met:
             return Outcome(cause, detail, [], 0, {}, fault)
         rejected = {reason.name: n for reason, n in self._telemetry.rejected.items() if n}
         return Outcome(cause, detail, self._sequence.changes, self._lost, rejected, fault)
@@ -178,7 +179,7 @@ class FlightLoop:
 
     def _leave(self, detail: str) -> str:
         """However it ended: a vehicle that may still be following setpoints gets the coast setpoint and Hold."""
-        if not hasattr(self, "_sequence") or not self._sequence.owes_hold:
+        if not self._met or not self._sequence.owes_hold:
             return detail
         with contextlib.suppress(Exception):  # what failed may fail again; Hold is asked for all the same
             self._coast()
@@ -205,6 +206,7 @@ class FlightLoop:
         self._sequence = Sequence(
             self._flight, self._trajectory, self._ops, self._autopilot, self._engage, self._notify
         )
+        self._met = True
 
     def _begin(self) -> bool:
         """Begins the flight once the vehicle's time is known, and whether it waits for us."""
@@ -218,6 +220,7 @@ class FlightLoop:
             return False
         now_s = self._clock.now_s(wall_ns)
         self._heartbeat_s = self._last_state_s = now_s
+        self._last_arrival_ns = wall_ns
         in_lockstep = ", in lockstep" if self._peer.paced else ""
         peer = f"system {self._ops.target_system}{in_lockstep}"
         self._sequence.enter(Phase.CONNECT, now_s, f"heard the autopilot ({peer})")
@@ -267,28 +270,9 @@ class FlightLoop:
         elif msgid == codec.TIMESYNC:
             self._on_timesync(frame)
         elif msgid == codec.HEARTBEAT:
-            heartbeat = codec.decode_heartbeat(frame.payload)
-            self._autopilot.mode = Mode.from_custom_mode(heartbeat.custom_mode)
-            self._autopilot.armed = heartbeat.armed
+            take_heartbeat(self._autopilot, frame)
         elif not self._ops.on_frame(frame, self._clock.now_s(frame.arrival_wall_ns)):
-            self._on_cold(frame)
-
-    def _on_cold(self, frame: Frame) -> None:
-        if frame.msgid not in {CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION}:
-            return
-        message: Any = codec.decode_cold(frame)
-        if message is None:
-            return
-        if frame.msgid == CURRENT_MODE:
-            self._autopilot.mode = Mode.from_custom_mode(message.custom_mode)
-            self._autopilot.intended = Mode.from_custom_mode(message.intended_custom_mode)
-        elif frame.msgid == EXTENDED_SYS_STATE:
-            value = message.landed_state
-            known = {state.value for state in LandedState}
-            self._autopilot.landed = LandedState(value) if value in known else LandedState.UNDEFINED
-        elif all(math.isfinite(x) for x in (message.x, message.y, message.z)):
-            self._autopilot.home = (message.x, message.y, message.z)
-            self._autopilot.home_amsl_m = message.altitude * 1e-3
+            take_report(self._autopilot, frame)
 
     def _on_odometry(self, frame: Frame) -> None:
         state = self._telemetry.on_odometry(frame)
@@ -331,12 +315,15 @@ class FlightLoop:
         sequence = self._sequence
         if not sequence.changes and not self._begin():
             return
-        now_s = self._clock.now_s(time.monotonic_ns())
+        wall_ns = time.monotonic_ns()
+        now_s = self._clock.now_s(wall_ns)
         if now_s - self._heartbeat_s >= HEARTBEAT_INTERVAL_S:
             self._heartbeat_s = now_s
             send_heartbeat(self._wire)
-        if sequence.duty is not Duty.NOTHING and now_s - self._last_state_s > self._silence_s:
-            self._stop_answering(Cause.STATE_LOST, f"none for {self._silence_s * 1e3:.0f} ms of vehicle time", now_s)
+        # A better estimate of the vehicle's clock is no silence: only a vehicle in lockstep is judged by its own time.
+        silent_s = now_s - self._last_state_s if self._peer.paced else (wall_ns - self._last_arrival_ns) * 1e-9
+        if sequence.duty is not Duty.NOTHING and silent_s > self._silence_s:
+            self._stop_answering(Cause.STATE_LOST, f"none for {self._silence_s * 1e3:.0f} ms", now_s)
         sequence.tick(now_s)
 
     def _stop_answering(self, cause: Cause, detail: str, now_s: float) -> None:
@@ -357,7 +344,7 @@ class FlightLoop:
         sequence, arrival_ns = self._sequence, self._pending_wall_ns
         now_s = self._clock.now_s(arrival_ns)
         before, self._last_state = self._last_state, state
-        self._last_state_s = now_s
+        self._last_state_s, self._last_arrival_ns = now_s, arrival_ns
         sequence.on_state(state, now_s)
         if sequence.duty is Duty.NOTHING:
             return
@@ -393,7 +380,8 @@ class FlightLoop:
 
     def _engage(self, state: VehicleState) -> None:
         """OFFBOARD is confirmed: the controller starts from the hover."""
-        self._tracker.begin(State(state.p, state.v, state.q, state.w))
+        thrust_n = hover_thrust_n(self._autopilot, self._flight.vehicle, state.q)
+        self._tracker.begin(State(state.p, state.v, state.q, state.w), thrust_n)
 
     def _track(self, state: VehicleState, skipped: int, arrival_ns: int) -> None:
         sequence = self._sequence
@@ -412,7 +400,9 @@ class FlightLoop:
         timing = self._timing(state, skipped, arrival_ns, sent_ns)
         row = control_row(shown_s, phase, state, reference, error, out, timing)
         self._record.append(row)
-        self._guard(state, error, self._clock.now_s(arrival_ns))
+        finding = self._guards.check(state.q, error, self._last_state_s)
+        if finding is not None:
+            sequence.end(*finding, self._last_state_s)
         if sent_ns - self._progress_ns > PROGRESS_NS:
             self._progress_ns = sent_ns
             self._progress(Progress(phase.value, track_s, course.track_s, math.hypot(*error), len(self._record)))
@@ -435,39 +425,13 @@ class FlightLoop:
             self._sent_us = state.t_vehicle_us
         return sent
 
-    def _guard(self, state: VehicleState, error: Vec3, now_s: float) -> None:
-        """The bounds that a flight is ended by."""
-        limits = self._flight.vehicle.limits
-        size = math.hypot(*error)
-        if size > limits.position_error_abort_m:
-            detail = f"{size:.2f} m, limit {limits.position_error_abort_m:g} m (limits.position_error_abort_m)"
-            self._sequence.end(Cause.POSITION_ERROR, detail, now_s)
-        tilt = tilt_from_quat(state.q)
-        if tilt <= limits.tilt_max_rad:
-            self._tilted_since_s = None
-        elif self._tilted_since_s is None:
-            self._tilted_since_s = now_s
-        elif now_s - self._tilted_since_s > TILT_FOR_S:
-            detail = f"{tilt:.2f} rad for {TILT_FOR_S:g} s, limit {limits.tilt_max_rad:g} rad (limits.tilt_max_rad)"
-            self._sequence.end(Cause.TILT, detail, now_s)
-
     def _coast(self) -> None:
-        """The one setpoint without a fresh state: no rotation, hover thrust over the cosine of the tilt."""
+        """The one setpoint without a fresh state."""
         state = self._last_state
         if self._coasted or state is None or self._sequence.duty is Duty.NOTHING:
             return
         self._coasted = True
-        vehicle, limits = self._flight.vehicle, self._flight.vehicle.limits
-        cosine = max(axes(state.q)[2][2], 0.3)
-        thrust_n = min(max(vehicle.body.mass_kg * GRAVITY_M_S2 / cosine, limits.thrust_min_n), limits.thrust_max_n)
-        thrust = thrust_fraction(thrust_n, vehicle.thrust_full_n, vehicle.rotors.curve_factor)
-        kind = self._flight.output.kind
-        setpoint: Setpoint = RateSetpoint(thrust, (0.0, 0.0, 0.0))
-        if kind == "attitude":
-            setpoint = AttitudeSetpoint(thrust, state.q, 0.0)
-        elif kind == "actuators":
-            setpoint = ActuatorSetpoint(thrust, (0.0, 0.0, 0.0))
-        self._send(setpoint, state)
+        self._send(coast_setpoint(self._flight, state.q), state)
 
 
 __all__ = ["FlightLoop", "Progress"]

@@ -87,6 +87,8 @@ class Autopilot:
     """Home position in the local frame, NED [m]."""
     home_amsl_m: float | None = None
     """Its altitude above mean sea level [m]."""
+    hold_thrust: float | None = None
+    """Thrust setpoint while the autopilot itself held the vehicle, smoothed (0 to 1)."""
     parameters: dict[str, float] = field(default_factory=dict)
 
 

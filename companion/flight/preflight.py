@@ -29,6 +29,8 @@ REQUEST_TIMEOUT_S = 8.0
 FIRST_STATE_TIMEOUT_S = 5.0
 
 PARAMETERS = ("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE", "THR_MDL_FAC")
+NEEDED = ("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE")
+"""What the gates and the loop's own silence go by."""
 
 _STICK_ACTIONS = (0.0, 1.0, 2.0)
 """COM_OBL_RC_ACT: Position, Altitude, Stabilized; without sticks NAV_RCL_ACT acts instead."""
@@ -38,6 +40,7 @@ _NO_ACTIONS = (0.0, 7.0)
 CURRENT_MODE = 436
 EXTENDED_SYS_STATE = 245
 HOME_POSITION = 242
+ATTITUDE_TARGET = 83
 
 MESSAGE_RATES_HZ = {CURRENT_MODE: 10.0, EXTENDED_SYS_STATE: 5.0}
 """Beside ODOMETRY, which is asked for at the vehicle file's rate."""
@@ -180,6 +183,9 @@ class Preflight:
         odometry = self._pending[0]
         if not odometry.accepted:
             raise FlightEnded(Cause.REFUSED, f"{odometry.sentence}; the flight needs it as its one state")
+        for name in NEEDED:
+            if name not in self._autopilot.parameters:
+                raise FlightEnded(Cause.REFUSED, f"{self._reads[name].sentence}; the flight must know it")
         if self._autopilot.parameters.get("MAV_TYPE") == 0.0 and self._flight.output.kind != "actuators":
             raise FlightEnded(
                 Cause.REFUSED,

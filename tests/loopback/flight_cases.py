@@ -15,12 +15,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import tomlkit
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.config import Flight, build_flight, find, read_toml
 from companion.errors import ExitCode
+from companion.flight import loop as loop_module
 from companion.flight.bundled import free_udp_port
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
@@ -30,6 +32,7 @@ from companion.record.flight_record import FlightRecord
 from companion.record.summary import FlightMeta, summarise
 from companion.trajectory.load import of_flight
 from sim_link import codec
+from sim_link import peer as peer_module
 from sim_link.modes import Mode
 from sim_link.peer import Peer, PeerOptions
 from sim_link.vehicle import Vehicle, VehicleOptions
@@ -139,18 +142,23 @@ class Stand:
         self._things: list[tuple[float, Callable[[], object]]] = []
         self._decoder = codec.Decoder()
         self._stopping = False
+        self._patches = contextlib.ExitStack()
         self._send, self._receive = self.peer.companion.send, self.peer.companion.receive
         self.peer.companion.send = self._sending  # type: ignore[method-assign]
         self.peer.companion.receive = self._receiving  # type: ignore[method-assign]
         self._thread = threading.Thread(target=self.peer.run, daemon=True)
 
     def __enter__(self) -> Stand:
+        for module, name in ((loop_module, "LOCKSTEP_SPIN_S"), (peer_module, "_SPIN_S")):
+            # Waiting without sleeping pays for processes, not for two threads that take turns.
+            self._patches.enter_context(patch.object(module, name, 0.0))
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
         self.peer.close()
+        self._patches.close()
 
     def stop(self) -> None:
         """As if the vehicle's process had ended (its port stays)."""
@@ -165,9 +173,14 @@ class Stand:
         self._things.append((seconds, thing))
 
     @property
+    def t_us(self) -> int:
+        """Vehicle time of the last state sent, which the companion is answering."""
+        return max(self.vehicle.start_us, self.peer._awaited_ns // 1000)
+
+    @property
     def offboard_s(self) -> float:
         """Vehicle time since OFFBOARD was entered first; negative infinity before."""
-        return -math.inf if self.offboard_us is None else (self.vehicle.t_us - self.offboard_us) * 1e-6
+        return -math.inf if self.offboard_us is None else (self.t_us - self.offboard_us) * 1e-6
 
     @property
     def mode(self) -> Mode:
@@ -175,7 +188,7 @@ class Stand:
 
     def _sending(self, outbox: list[bytes]) -> None:
         if self.offboard_us is None and self.mode is Mode.OFFBOARD:
-            self.offboard_us = self.vehicle.t_us
+            self.offboard_us = self.t_us
         due = [thing for thing in self._things if thing[0] <= self.offboard_s]
         for thing in due:
             self._things.remove(thing)
@@ -189,7 +202,7 @@ class Stand:
         if datagram is None:
             return None
         for frame in datagram[0]:
-            self.heard.append(Heard(self.vehicle.t_us, frame.msg_id, self._decoder.message(frame)))
+            self.heard.append(Heard(self.t_us, frame.msg_id, self._decoder.message(frame)))
         return [frame for frame in datagram[0] if not self.deaf(self, frame)], datagram[1]
 
     # What was heard

@@ -34,7 +34,8 @@ def test_from_the_ground_and_back(tmp_path) -> None:
     """Take-off, a smooth join, the trajectory, a stop, a landing; every change of phase has its reason."""
     trajectory = dict(INDOOR) | {"duration_s": 2.0}
     flight = make_flight(trajectory=trajectory, takeoff_altitude_m=3.0, after="land")
-    with Stand(flight, tmp_path, start=None) as stand:
+    quick = {"MPC_LAND_SPEED": 1.4, "COM_DISARM_LAND": 0.5, "MPC_TKO_RAMP_T": 1.0}
+    with Stand(flight, tmp_path, start=None, parameters=quick) as stand:
         flown = stand.fly()
         assert not stand.vehicle.autopilot.armed
         assert stand.vehicle.autopilot.land.landed
@@ -94,6 +95,7 @@ REFUSALS = {
     ),
     "actuators on 1.18": (dict(), dict(output__kind="actuators"), "since 1.14; use output rates"),
     "few states": (dict(), {}, "ODOMETRY comes at 50 Hz, 80 Hz are required"),
+    "no parameters": (dict(), {}, "reading COM_OBL_RC_ACT got no answer"),
 }
 
 
@@ -106,7 +108,10 @@ def test_refused_before_anything_moves(what: str, tmp_path) -> None:
         every_second[0] += msg_id == codec.ID_ODOMETRY
         return [] if msg_id == codec.ID_ODOMETRY and every_second[0] % 2 else [raw]
 
-    alter = thinned if what == "few states" else None
+    def mute(stand, msg_id, raw):
+        return [] if msg_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE else [raw]
+
+    alter = {"few states": thinned, "no parameters": mute}.get(what)
     with Stand(make_flight(**changes), tmp_path, alter=alter, **options) as stand:
         flown = stand.fly()
         assert stand.mode is Mode.HOLD
@@ -214,7 +219,7 @@ def test_no_vehicle(who: str) -> None:
 
 def test_vehicle_is_found_behind_a_louder_sender(tmp_path, monkeypatch) -> None:
     """The link locks on to the first sender, but not for good when that one is no vehicle."""
-    monkeypatch.setattr(connect, "PEER_PATIENCE_NS", 100_000_000)
+    monkeypatch.setattr(connect, "PEER_PATIENCE_NS", 500_000_000)
     flight = make_flight(trajectory=dict(HOVER) | {"duration_s": 0.2})
     with Stand(flight, tmp_path) as stand, Caller(stand.port, [GROUND_STATION]):
         flown = stand.fly()

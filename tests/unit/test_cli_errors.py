@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -214,22 +213,3 @@ def test_a_connection_that_is_none(
     error = capfd.readouterr().err.splitlines()[-1]
     assert words in error
     assert connection in error
-
-
-def test_no_vehicle_and_a_port_in_use(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        port = other.getsockname()[1]
-        fly = ["fly", "circle", "--vehicle", "bundled", "--engine", "python", "--timeout", "0.3"]
-        fly += ["--connect", f"udpin:127.0.0.1:{port}"]
-        assert main(fly) == ExitCode.LOST
-        error = capfd.readouterr().err.splitlines()[-1]
-        assert f"{port}" in error
-        assert "in use" in error
-    assert main(fly) == ExitCode.LOST
-    error = capfd.readouterr().err.splitlines()[-1]
-    assert f"nothing came at udpin:127.0.0.1:{port} within 0.3 s" in error
-    assert "--connect" in error

@@ -111,7 +111,7 @@ def test_csv_that_cannot_be_written(short: str, tmp_path: Path, capsys: pytest.C
     assert f"companion: {out}: cannot be written" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["paper", "eight", "bundled", "px4_sih"])
+@pytest.mark.parametrize("name", ["eight", "bundled", "px4_sih"])
 def test_every_bundled_gain_set_is_certified_with_margin(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["certify", name, "--json"]) == 0
     found = document(capsys)

@@ -52,6 +52,8 @@ class VirtualWire:
         self.stall: tuple[float, float] | None = None
         """When after OFFBOARD the companion is stopped, and for how long [s]."""
         self.dead = False
+        self.later: list[bytes] = []
+        """What arrives on its own, after the rest."""
         self._parser = FrameParser(message_formats(), self.counters, None)
         self._decoder = codec.Decoder()
         self._next_ns = START_NS
@@ -65,7 +67,9 @@ class VirtualWire:
         if self.stall is not None and self.offboard_s >= self.stall[0]:
             self._advance_to(self.now_ns + int(self.stall[1] * 1e9))
             self.stall = None
-        elif not self._waiting:
+        elif self.later:
+            self._waiting, self.later = self.later, []
+        else:
             end_ns = self.now_ns + int(timeout_s * 1e9)
             self._advance_to(end_ns if self.dead else min(end_ns, max(self._next_ns, self.now_ns)))
         frames: list[Frame] = []
@@ -110,6 +114,13 @@ class VirtualWire:
         begun = math.inf if self.offboard_us is None else self.offboard_us
         found = [((t - begun) * 1e-6, m) for t, number, m in self.sent if number == msg_id]
         return [(t, m) for t, m in found if t >= from_s]
+
+
+def restamped(raw: bytes, by_us: int) -> bytes:
+    """An ODOMETRY frame with another time."""
+    payload = bytearray(codec.frames(raw)[0].payload)
+    payload[0:8] = (int.from_bytes(payload[0:8], "little") + by_us).to_bytes(8, "little")
+    return codec.Encoder(1, 1).hot(ODOMETRY, bytes(payload))
 
 
 def plain(value: Any) -> Any:
@@ -195,6 +206,24 @@ def test_long_stall_ends_the_flight(flight: Flight, wire: VirtualWire) -> None:
     assert wire.vehicle.autopilot.mode is wire.vehicle.autopilot.intended is Mode.HOLD
 
 
+def test_better_estimate_of_the_clock_is_no_silence(flight: Flight, wire: VirtualWire) -> None:
+    """States are old, and the first TIMESYNC requests came 80 ms late; the next ones do not."""
+
+    def alter(msg_id: int, raw: bytes) -> list[bytes]:
+        if msg_id == ODOMETRY:
+            return [restamped(raw, -60_000)]
+        if msg_id != TIMESYNC:
+            return [raw]
+        tc1, ts1 = codec.timesync(codec.frames(raw)[0].payload)
+        late_ns = 0 if wire.offboard_s >= 0.5 else 80_000_000
+        wire.later.append(codec.Encoder(1, 1).hot(TIMESYNC, codec.TIMESYNC.pack(tc1, ts1 - late_ns, 0, 0)))
+        return []
+
+    wire.alter = alter
+    outcome, _ = fly(flight, wire)
+    assert outcome.cause is Cause.COMPLETED, outcome.sentence
+
+
 def test_states_that_cease(flight: Flight, wire: VirtualWire) -> None:
     """The companion's own clock tells; nothing else needs to come from the vehicle."""
     wire.alter = lambda msg_id, raw: [] if wire.offboard_s >= 0.8 and msg_id in {ODOMETRY, TIMESYNC} else [raw]
@@ -254,9 +283,7 @@ def test_rebooted_autopilot_is_asked_for_hold_on_the_wall_clock(flight: Flight, 
             return [raw]
         if msg_id == TIMESYNC:
             return []
-        payload = bytearray(codec.frames(raw)[0].payload)
-        payload[0:8] = (int.from_bytes(payload[0:8], "little") - 3_000_000).to_bytes(8, "little")
-        return [codec.Encoder(1, 1).hot(ODOMETRY, bytes(payload))]
+        return [restamped(raw, -3_000_000)]
 
     wire.alter = alter
     outcome, _ = fly(flight, wire)

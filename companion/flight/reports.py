@@ -1,0 +1,69 @@
+"""What the autopilot says of itself between its states: mode, arming, ground contact, home, the thrust of its hover."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from companion.config import Vehicle
+from companion.control.types import GRAVITY_M_S2, Quat
+from companion.control.vectors import axes
+from companion.flight.phases import Autopilot, LandedState
+from companion.flight.preflight import ATTITUDE_TARGET, CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION
+from companion.link import codec
+from companion.link.framing import Frame
+from companion.link.modes import HOLD, Mode
+
+HOLD_THRUST_SHARE = 0.2
+"""Of a new value in the smoothed thrust of the autopilot's hover."""
+HOLD_THRUST_TRUST = 0.25
+"""A measured hover thrust further from the weight is not believed: the vehicle file or the message is wrong."""
+
+_LANDED_STATES = {state.value: state for state in LandedState}
+_REPORTS = {CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET}
+
+
+def take_heartbeat(autopilot: Autopilot, frame: Frame) -> None:
+    """HEARTBEAT: the mode that is flown, and whether the motors may turn."""
+    heartbeat = codec.decode_heartbeat(frame.payload)
+    autopilot.mode = Mode.from_custom_mode(heartbeat.custom_mode)
+    autopilot.armed = heartbeat.armed
+
+
+def take_report(autopilot: Autopilot, frame: Frame) -> None:
+    """CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET; others, and what cannot be read, change
+    nothing."""
+    if frame.msgid not in _REPORTS:
+        return
+    message: Any = codec.decode_cold(frame)
+    if message is None:
+        return
+    if frame.msgid == CURRENT_MODE:
+        autopilot.mode = Mode.from_custom_mode(message.custom_mode)
+        autopilot.intended = Mode.from_custom_mode(message.intended_custom_mode)
+    elif frame.msgid == EXTENDED_SYS_STATE:
+        autopilot.landed = _LANDED_STATES.get(message.landed_state, LandedState.UNDEFINED)
+    elif frame.msgid == ATTITUDE_TARGET:
+        if autopilot.mode == HOLD and 0.0 < message.thrust < 1.0:
+            before = message.thrust if autopilot.hold_thrust is None else autopilot.hold_thrust
+            autopilot.hold_thrust = before + HOLD_THRUST_SHARE * (message.thrust - before)
+    elif all(math.isfinite(x) for x in (message.x, message.y, message.z)):
+        autopilot.home = (message.x, message.y, message.z)
+        autopilot.home_amsl_m = message.altitude * 1e-3
+
+
+def hover_thrust_n(autopilot: Autopilot, vehicle: Vehicle, q: Quat) -> float | None:
+    """The thrust that held the vehicle, by the autopilot's own setpoint [N]; None when unknown or hard to believe.
+
+    Args:
+        autopilot: what it said.
+        vehicle: weight and thrust curve.
+        q: the attitude.
+    """
+    share = autopilot.hold_thrust
+    if share is None:
+        return None
+    curve = vehicle.rotors.curve_factor
+    thrust_n = vehicle.thrust_full_n * share * (curve * share + 1.0 - curve)
+    expected_n = vehicle.body.mass_kg * GRAVITY_M_S2 / max(axes(q)[2][2], 0.5)
+    return thrust_n if abs(thrust_n - expected_n) < HOLD_THRUST_TRUST * expected_n else None
