@@ -79,7 +79,7 @@ def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: St
     trajectory = of_flight(flight)
     gate_gains(flight.vehicle)
     compiled = kernels(engine)
-    _warm_up(flight, compiled)
+    warm_up(flight, compiled)
     status.line(f"engine: {compiled.engine}")
     capacity = int((trajectory.duration_s + MARGIN_S) * flight.vehicle.link.state_rate_hz * 1.1)
     record = FlightRecord(capacity, PHASE_NAMES)
@@ -104,7 +104,7 @@ def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: St
     return _finish(folder, flight, trajectory, record, outcome, status)
 
 
-def _warm_up(flight: Any, compiled: Any) -> None:
+def warm_up(flight: Any, compiled: Any) -> None:
     """Compiles or loads what a control step needs, before anything connects: nothing is compiled in the air."""
     from companion.control.types import State
     from companion.flight.course import at_rest

@@ -26,6 +26,7 @@ from companion.flight import loop as loop_module
 from companion.flight.bundled import free_udp_port
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
+from companion.flight.process import warm_up
 from companion.flight.tracker import kernels
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
@@ -230,11 +231,13 @@ class Stand:
     ) -> Iterator[tuple[FlightLoop, FlightRecord, list]]:
         record = FlightRecord(20_000, PHASE_NAMES)
         lines: list[str] = []
+        compiled = kernels(engine)
+        warm_up(self.flight, compiled)  # as the control process does: nothing is compiled in the air
         with Wire.open(f"udpin:127.0.0.1:{self.port}") as wire:
             trajectory = of_flight(self.flight)
             yield (
                 FlightLoop(
-                    *(self.flight, trajectory, wire, record, kernels(engine), lines.append),
+                    *(self.flight, trajectory, wire, record, compiled, lines.append),
                     connect_timeout_s=timeout_s,
                     connection=f"udpin:127.0.0.1:{self.port}",
                 ),
