@@ -18,6 +18,7 @@ _IDLE_W = 5.0
 _STANDARD_G = 9.80665
 _CELL_RESISTANCE_OHM = 0.005
 """What PX4 assumes where BAT1_R_INTERNAL is negative."""
+_TIME_MAX_S = 1.0e9
 _COMPENSATION_MAX = 1.3
 """MC_BAT_SCALE_EN never raises the thrust beyond this factor."""
 
@@ -77,7 +78,7 @@ class Battery:
         if not self.is_sized or self.current_a <= 0.0:
             return 0
         left_mah = self.remaining * self._parameters.number("BAT1_CAPACITY")
-        return max(1, round(left_mah * 3.6 / self.current_a))
+        return max(1, round(min(left_mah * 3.6 / self.current_a, _TIME_MAX_S)))
 
     def update(self, rotor_n: Vec4, armed: bool, dt_s: float) -> None:
         """Draw for dt_s the power that rotor thrusts [N] need: as thrust^(3/2), as a rotor in hover does."""

@@ -297,9 +297,9 @@ class Guidance:
         """Move the velocity setpoint towards `wanted` within the acceleration limits."""
         north, east = wanted[0] - self._v[0], wanted[1] - self._v[1]
         change = math.hypot(north, east)
-        limit = self._parameters.number("MPC_ACC_HOR") * dt_s
+        limit = self._parameters.within("MPC_ACC_HOR", 0.1, 1000.0) * dt_s
         share = 1.0 if change <= limit else limit / change
-        up = self._parameters.number("MPC_ACC_UP_MAX") * dt_s
-        down = self._parameters.number("MPC_ACC_DOWN_MAX") * dt_s
+        up = self._parameters.within("MPC_ACC_UP_MAX", 0.1, 1000.0) * dt_s
+        down = self._parameters.within("MPC_ACC_DOWN_MAX", 0.1, 1000.0) * dt_s
         vertical = min(max(wanted[2] - self._v[2], -up), down)
         self._v = (self._v[0] + share * north, self._v[1] + share * east, self._v[2] + vertical)

@@ -166,7 +166,7 @@ class Telemetry:
         autopilot = self._autopilot
         flags = autopilot.mode.base_flags | (FLAG_ARMED if autopilot.armed else 0)
         return mavlink.MAVLink_heartbeat_message(
-            self._parameters.integer("MAV_TYPE"),
+            self._parameters.integer("MAV_TYPE") & 0xFF,
             mavlink.MAV_AUTOPILOT_PX4,
             flags,
             autopilot.mode.custom_mode,

@@ -21,6 +21,7 @@ IDLE = Setpoint(RATES, 0.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), math.nan, (0.
 
 _RANGES = {
     "MPC_XY_VEL_P_ACC": (0.1, 20.0),
+    "MPC_XY_VEL_MAX": (0.1, 1000.0),
     "MPC_TILTMAX_AIR": (1.0, 85.0),
     "MPC_THR_MIN": (0.01, 0.5),
     "MPC_THR_MAX": (0.5, 1.0),

@@ -12,7 +12,7 @@ mavutil = pytest.importorskip("pymavlink.mavutil")
 mavwp = pytest.importorskip("pymavlink.mavwp")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def link():
     with vehicle() as ready:
         connection = mavutil.mavlink_connection(f"udpin:127.0.0.1:{ready['ground_remote_port']}")

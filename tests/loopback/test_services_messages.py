@@ -1,17 +1,24 @@
 """Every message that the vehicle has, the rates of both links, the battery, and the commands beyond flying."""
 
 import math
+import random
 import struct
 
 import pytest
-from vehicle_tools import HOLD, IN_AIR, LAND, RETURN, TAKEOFF, Flight, mavlink, vehicle_file
+from vehicle_tools import HOLD, IN_AIR, LAND, RETURN, TAKEOFF, Flight, framed, mavlink, vehicle_file
 
 from sim_link.link_rates import GROUND_HZ, ONBOARD_HZ
+from sim_link.missions import Item
+from sim_link.modes import Mode
 from sim_link.outputs import commands
-from sim_link.parameter_set import DEFAULTS
+from sim_link.parameter_set import DEFAULTS, READ_ONLY
+from sim_link.parameters import INT32, REAL32
 from sim_link.sensors import altitude_at_m, pressure_hpa
+from sim_link.vehicle import Vehicle, VehicleOptions
 from sim_link.vehicle_file import load
 
+# Few states and few steps a second: what is looked at here is slow.
+QUICK = vehicle_file(25.0, loop_rate_hz=250.0)
 ACK, REJECTED, DENIED, UNSUPPORTED, IN_PROGRESS = 0, 1, 2, 3, 5
 NAMES = {number: cls.msgname for number, cls in mavlink.mavlink_map.items()}
 SILENT = {"WIND_COV", "RC_CHANNELS", "MANUAL_CONTROL"}
@@ -20,7 +27,7 @@ ON_ITS_OWN = {"TIMESYNC"}
 
 
 def test_every_message_of_the_tables_can_be_requested():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         c.run(0.1)
         for number in ONBOARD_HZ.keys() | GROUND_HZ.keys():
             name = NAMES[number]
@@ -95,7 +102,7 @@ def test_instruments_agree_with_the_state():
 
 
 def test_disarmed_outputs_and_prearm_health():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         c.run(0.3)
         assert c.request("SERVO_OUTPUT_RAW") == ACK
         assert c.last["SERVO_OUTPUT_RAW"].servo2_raw == 900
@@ -110,7 +117,7 @@ def test_disarmed_outputs_and_prearm_health():
 
 
 def test_ping_is_answered_to_whoever_sent_it():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         c.log.clear()
         c.send(mavlink.MAVLink_ping_message(123, 7, 0, 0))
         c.send(mavlink.MAVLink_ping_message(456, 8, 1, 1))
@@ -130,7 +137,7 @@ def test_file_transfer_is_answered_with_nothing():
         assert content[5] == opcode
         return content[3], content[12] if content[4] else None
 
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         assert ask(c, 2) == (128, None)
         assert ask(c, 3, b"/") == (129, 6), "end of an empty directory"
         assert ask(c, 4, b"/no/such/file") == (129, 10)
@@ -139,7 +146,7 @@ def test_file_transfer_is_answered_with_nothing():
 
 
 def test_the_list_of_modes():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         c.log.clear()
         assert c.request("AVAILABLE_MODES") == ACK
         modes = c.of_type("AVAILABLE_MODES")
@@ -159,7 +166,7 @@ def test_the_list_of_modes():
 
 
 def test_reposition_flies_there_and_holds():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         place = (473977420 + 899, 85455940, 489.4 + 22.0)  # 10 m north
         int_command = mavlink.MAVLink_command_int_message
         number = mavlink.MAV_CMD_DO_REPOSITION
@@ -189,7 +196,7 @@ def test_reposition_flies_there_and_holds():
 
 
 def test_autotuning_is_in_progress_until_it_is_done():
-    with Flight(start=IN_AIR, file=vehicle_file(25.0)) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         number = mavlink.MAV_CMD_DO_AUTOTUNE_ENABLE
         progress = []
         while c.command(number, 1) == IN_PROGRESS:
@@ -198,12 +205,12 @@ def test_autotuning_is_in_progress_until_it_is_done():
         assert progress == sorted(progress) and 5 <= len(progress) < 8
         assert c.last["COMMAND_ACK"].result == ACK
         assert c.command(number, 0) == DENIED
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         assert c.command(mavlink.MAV_CMD_DO_AUTOTUNE_ENABLE, 1) == REJECTED
 
 
 def test_parameters_can_be_reset_and_the_rotors_geometry_is_read_only():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         c.set_param("MPC_XY_P", 1.5)
         assert c.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 9) == UNSUPPORTED
         assert c.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 2) == ACK
@@ -216,7 +223,7 @@ def test_parameters_can_be_reset_and_the_rotors_geometry_is_read_only():
         c.send(mavlink.MAVLink_param_set_message(1, 1, b"CA_ROTOR0_PX", 9.0, 9))
         c.run(0.1)
         assert (c.last["PARAM_ERROR"].param_id, c.last["PARAM_ERROR"].error) == ("CA_ROTOR0_PX", 5)
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         assert c.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 2) == REJECTED
 
 
@@ -243,7 +250,7 @@ def test_what_a_companion_reads_is_there_at_px4_s_defaults():
 
 def flown(**parameters):
     """Hover for 20 s; gives the battery and the thrust commanded at the end."""
-    flight = Flight(start=IN_AIR, parameters=parameters, file=vehicle_file(25.0))
+    flight = Flight(start=IN_AIR, parameters=parameters, file=QUICK)
     with flight as c:
         c.run(20.0)
         assert c.request("BATTERY_STATUS") == ACK
@@ -270,7 +277,7 @@ def test_a_battery_of_a_size_drains_with_power_and_sags_thrust():
 @pytest.mark.parametrize(("act", "mode"), [(0, HOLD), (2, LAND), (3, RETURN)])
 def test_a_critical_battery_acts_as_asked(act, mode):
     drained = {"COM_LOW_BAT_ACT": act, "BAT_CRIT_THR": 0.95, "BAT_LOW_THR": 0.97, "BAT_EMERGEN_THR": 0.1}
-    with Flight(start=((30.0, 0.0, -20.0), 0.0), parameters={**drained, "COM_FAIL_ACT_T": 1.0}) as c:
+    with Flight(start=((30.0, 0.0, -20.0), 0.0), parameters={**drained, "COM_FAIL_ACT_T": 1.0}, file=QUICK) as c:
         c.until(lambda: "Critical battery" in c.texts(), 10.0)
         assert "Low battery" in c.texts()
         c.run(2.0)
@@ -294,3 +301,48 @@ def test_pressure_and_altitude_are_inverse():
         assert altitude_at_m(pressure_hpa(altitude)) == pytest.approx(altitude, abs=1e-6)
     assert pressure_hpa(0.0) == 1013.25
     assert struct.pack("<f", pressure_hpa(math.nan)) == struct.pack("<f", 1013.25)
+
+
+def test_valid_frames_with_any_content_do_not_end_the_vehicle():
+    """Every message that these services take, with random bytes under a right checksum."""
+    draw = random.Random(8)
+    ids = (4, 39, 40, 41, 43, 44, 45, 47, 51, 69, 70, 73, 75, 76, 84, 86, 110)
+    numbers = (178, 179, 187, 192, 212, 224, 245, 262, 300, 401, 512)
+    with Flight(start=IN_AIR, file=QUICK) as c:
+        for _ in range(60):
+            for number in ids:
+                cls = mavlink.mavlink_map[number]
+                fields = list(cls.unpacker.unpack(draw.randbytes(cls.unpacker.size)))
+                names = [*cls.ordered_fieldnames]
+                for name, value in (("target_system", 1), ("target", 1), ("target_component", 1), ("mission_type", 0)):
+                    if name in names and draw.random() < 0.8:
+                        fields[names.index(name)] = value
+                if "command" in names:
+                    fields[names.index("command")] = draw.choice(numbers)
+                payload = cls.unpacker.pack(*fields)
+                c.sock.sendto(framed(number, payload, cls.crc_extra, c.mav), c.vehicle)
+            c.step()
+        c.run(1.0)
+        assert c.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 148) == ACK
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -1e30, 0.0, 1e30, -1, 2**31 - 1, -(2**31), 7])
+def test_no_value_of_any_parameter_ends_the_vehicle(value):
+    vehicle = Vehicle(VehicleOptions(vehicle=QUICK, start=IN_AIR, engine="python"))
+    autopilot, parameters = vehicle.autopilot, vehicle.parameters
+    kind, form = (INT32, "<i") if isinstance(value, int) else (REAL32, "<f")
+    for name in parameters.names:
+        if parameters.type_of(name) == kind and name not in READ_ONLY:
+            parameters.set_wire(name, kind, struct.pack(form, value))
+    place = (473977420, 85455940, 25.0)
+    autopilot.plans.replace(0, [Item(6, 16, 0, 1, (0.0, 0.0, 0.0, math.nan), *place)])
+    for mode in Mode:
+        autopilot.set_mode(mode)
+        for _ in range(6):
+            autopilot.manual_control(300, 200, 700, 400)
+            vehicle.tick()
+            for link in vehicle.links:
+                link.outbox.clear()
+        for number in vehicle.companion.streams:
+            vehicle.telemetry.build(number)
+    assert vehicle.t_us > vehicle.start_us

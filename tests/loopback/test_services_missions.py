@@ -9,6 +9,8 @@ from vehicle_tools import HOLD, IN_AIR, LAND, OFFBOARD, RETURN, Flight, mavlink,
 
 from sim_link.geodesy import local_position
 
+# Few states and few steps a second: what is looked at here is slow.
+QUICK = vehicle_file(25.0, loop_rate_hz=250.0)
 MISSION_MODE = 4 << 16 | 4 << 24
 LATITUDE, LONGITUDE = 473977420, 85455940
 METRE = 1e7 * math.degrees(1.0 / 6371000.0)
@@ -85,7 +87,7 @@ def test_plans_of_all_kinds_come_back_as_they_went():
     square = [item(5001, n, e, params=(4.0, 0.0, 0.0, 0.0), frame=0) for n, e in ((9, 9), (9, -9), (-9, -9), (-9, 9))]
     circle = [item(5004, 5.0, 5.0, params=(2.5, 0.0, 0.0, 0.0), frame=0)]
     rally = [item(5100, 20.0, 0.0, 5.0, params=(0.0, 0.0, 0.0, 0.0))]
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         ids = set()
         for kind, entries in ((MISSION, SHORT), (FENCE, square + circle), (RALLY, rally)):
             result, number = upload(c, entries, kind)
@@ -109,7 +111,7 @@ def test_plans_of_all_kinds_come_back_as_they_went():
 
 
 def test_the_id_depends_on_every_field():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         seen = {upload(c, SHORT)[1]}
         for k, other in enumerate((item(16, 8.0, 0.0, 5.5), item(16, 8.0, 0.1, 5.0), item(17, 8.0, 0.0, 5.0))):
             seen.add(upload(c, [SHORT[0], other, *SHORT[2:]])[1])
@@ -129,14 +131,14 @@ REFUSED = [
 
 @pytest.mark.parametrize(("entries", "result", "why"), REFUSED)
 def test_items_that_are_refused_leave_the_plan_as_it_was(entries, result, why):
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         assert upload(c, SHORT)[0] == 0
         assert upload(c, entries)[0] == result, why
         assert plain(download(c)[0]) == plain(SHORT)
 
 
 def test_fences_that_are_none():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         triangle = [item(5001, n, e, params=(3.0, 0.0, 0.0, 0.0), frame=0) for n, e in ((0, 0), (9, 0))]
         assert upload(c, triangle, FENCE)[0] == 5, "a corner is missing"
         assert upload(c, [item(5001, params=(2.0, 0.0, 0.0, 0.0), frame=0)], FENCE)[0] == 1
@@ -148,7 +150,7 @@ def test_fences_that_are_none():
 
 
 def test_lost_items_are_asked_for_again_and_a_silent_sender_is_given_up():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         c.send(mavlink.MAVLink_mission_count_message(1, 1, 4, MISSION))
         c.until(lambda: asked(c) == 0, 0.2)
         c.log.clear()
@@ -171,7 +173,7 @@ def test_lost_items_are_asked_for_again_and_a_silent_sender_is_given_up():
 
 
 def test_an_unexpected_request_ends_a_download_and_requests_out_of_the_blue_are_silent():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         upload(c, SHORT)
         c.send(mavlink.MAVLink_mission_request_list_message(1, 1, MISSION))
         c.run(0.1)
@@ -192,7 +194,7 @@ def test_an_unexpected_request_ends_a_download_and_requests_out_of_the_blue_are_
 
 
 def test_a_transfer_on_one_link_keeps_the_other_out():
-    flight = Flight(ground=True)
+    flight = Flight(ground=True, file=QUICK)
     with flight as c:
         ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         count = mavlink.MAVLink_mission_count_message(1, 1, 2, MISSION).pack(ground)
@@ -204,7 +206,7 @@ def test_a_transfer_on_one_link_keeps_the_other_out():
 
 
 def test_a_mission_is_flown_to_its_end():
-    with Flight(file=vehicle_file(state_rate_hz=25.0)) as c:
+    with Flight(file=QUICK) as c:
         assert c.command(mavlink.MAV_CMD_MISSION_START, 0, 0) == 2, "there is none"
         assert c.set_mode(MISSION_MODE) == 0
         assert c.arm() == 1, "no valid mission"
@@ -238,7 +240,7 @@ def test_a_mission_is_flown_to_its_end():
 
 
 def test_a_mission_can_be_left_and_taken_up_again_at_any_item():
-    with Flight(start=IN_AIR, file=vehicle_file(state_rate_hz=25.0)) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         far = [item(16, 30.0, 0.0, 20.0), item(16, 30.0, 30.0, 20.0), item(20, frame=2)]
         assert upload(c, far)[0] == 0
         assert c.set_mode(MISSION_MODE) == 0
@@ -261,7 +263,7 @@ def test_a_mission_can_be_left_and_taken_up_again_at_any_item():
 def breach(action, **parameters):
     """Fly north in OFFBOARD beyond 10 m from home."""
     parameters = {"GF_MAX_HOR_DIST": 10.0, "GF_ACTION": action, "COM_OBL_RC_ACT": 4} | parameters
-    return Flight(start=IN_AIR, parameters=parameters, file=vehicle_file(state_rate_hz=50.0))
+    return Flight(start=IN_AIR, parameters=parameters, file=QUICK)
 
 
 NORTH = {"q": (math.cos(0.1), 0.0, -math.sin(0.1), 0.0), "thrust": 0.5}
@@ -304,24 +306,24 @@ def test_a_fence_that_terminates_and_one_that_only_warns():
 def test_uploaded_areas_and_the_height_count_too():
     square = [item(5001, n, e, params=(4.0, 0.0, 0.0, 0.0), frame=0) for n, e in ((9, 9), (9, -9), (-9, -9), (-9, 9))]
     hole = [item(5004, 6.0, 0.0, params=(2.0, 0.0, 0.0, 0.0), frame=0)]
-    with Flight(start=IN_AIR, parameters={"COM_OBL_RC_ACT": 4}) as c:
+    with Flight(start=IN_AIR, parameters={"COM_OBL_RC_ACT": 4}, file=QUICK) as c:
         assert upload(c, square, FENCE)[0] == 0
         c.enter_offboard(7, **NORTH)
         c.until(lambda: c.mode == HOLD, 15.0)
         assert 8.5 < c.position[0] < 11.0
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         assert upload(c, square + hole, FENCE)[0] == 0
         c.enter_offboard(7, **NORTH)
         c.until(lambda: c.mode == HOLD, 15.0)
         assert 3.5 < c.position[0] < 6.0
-    with Flight(start=IN_AIR, parameters={"GF_MAX_VER_DIST": 15.0}) as c:
+    with Flight(start=IN_AIR, parameters={"GF_MAX_VER_DIST": 15.0}, file=QUICK) as c:
         c.run(0.5)
         assert c.mode == HOLD and any("altitude" in text for text in c.texts())
 
 
 def test_outside_of_the_fence_nobody_arms():
     far = [item(5003, 100.0, 0.0, params=(5.0, 0.0, 0.0, 0.0), frame=0)]
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         assert upload(c, far, FENCE)[0] == 0
         c.run(0.5)
         assert c.arm() == 1
@@ -333,7 +335,7 @@ def test_outside_of_the_fence_nobody_arms():
 
 def test_return_goes_to_the_nearest_of_home_and_the_rally_points():
     start = ((25.0, 0.0, -12.0), 0.0)
-    with Flight(start=start, parameters={"RTL_RETURN_ALT": 12.0}, file=vehicle_file(state_rate_hz=25.0)) as c:
+    with Flight(start=start, parameters={"RTL_RETURN_ALT": 12.0}, file=QUICK) as c:
         assert c.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, math.nan, 8.5, 480.0) == 2, "no place"
         home = (1, 1, 0, mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0.0, 0.0, 0.0, 0.0, LATITUDE, LONGITUDE, 489.4)
         c.send(mavlink.MAVLink_command_int_message(*home))
@@ -345,7 +347,7 @@ def test_return_goes_to_the_nearest_of_home_and_the_rally_points():
 
 
 def test_positions_on_the_earth_are_consistent():
-    with Flight(start=((120.0, -80.0, -30.0), 0.0)) as c:
+    with Flight(start=((120.0, -80.0, -30.0), 0.0), file=QUICK) as c:
         for name in ("HOME_POSITION", "GPS_GLOBAL_ORIGIN", "GLOBAL_POSITION_INT", "GPS_RAW_INT"):
             assert c.request(name) == 0
         origin = c.last["GPS_GLOBAL_ORIGIN"]

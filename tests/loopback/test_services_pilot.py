@@ -3,8 +3,10 @@
 import math
 
 import pytest
-from vehicle_tools import HOLD, IN_AIR, OFFBOARD, RATES, RETURN, TAKEOFF, Flight, mavlink
+from vehicle_tools import HOLD, IN_AIR, OFFBOARD, RATES, RETURN, TAKEOFF, Flight, mavlink, vehicle_file
 
+# Few states and few steps a second: what is looked at here is slow.
+QUICK = vehicle_file(25.0, loop_rate_hz=250.0)
 POSITION, ALTITUDE, STABILIZED, ACRO, MANUAL = 3 << 16, 2 << 16, 7 << 16, 5 << 16, 1 << 16
 TEXT = "Pilot took over using sticks"
 
@@ -29,7 +31,7 @@ def begin(c, mode):
 
 
 def test_position_flies_as_fast_as_the_sticks_say_and_stays_when_they_are_let_go():
-    with Flight(start=((0.0, 0.0, -20.0), math.pi / 2), parameters={"MPC_VEL_MANUAL": 4.0}) as c:
+    with Flight(start=((0.0, 0.0, -20.0), math.pi / 2), parameters={"MPC_VEL_MANUAL": 4.0}, file=QUICK) as c:
         begin(c, POSITION)
         sticks(c, x=1000)  # the nose points east
         c.run(9.0)
@@ -49,7 +51,7 @@ def test_position_flies_as_fast_as_the_sticks_say_and_stays_when_they_are_let_go
 
 
 def test_altitude_holds_the_height_only():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         begin(c, ALTITUDE)
         sticks(c, y=400)
         c.run(2.0)
@@ -64,7 +66,7 @@ def test_altitude_holds_the_height_only():
 
 @pytest.mark.parametrize("mode", [STABILIZED, MANUAL])
 def test_stabilized_tilts_and_turns(mode):
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         begin(c, mode)
         sticks(c, x=-500)  # back: nose up
         c.run(1.5)
@@ -76,7 +78,7 @@ def test_stabilized_tilts_and_turns(mode):
 
 
 def test_acro_turns_as_fast_as_the_sticks_say():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         begin(c, ACRO)
         sticks(c, y=300, r=-200)
         c.run(0.6)
@@ -84,7 +86,7 @@ def test_acro_turns_as_fast_as_the_sticks_say():
 
 
 def test_arming_and_taking_off_by_hand():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         begin(c, POSITION)
         assert c.arm() == 0
         c.run(2.0)
@@ -99,7 +101,7 @@ def test_arming_and_taking_off_by_hand():
 
 @pytest.mark.parametrize("mode", [HOLD, RETURN])
 def test_a_quick_stick_takes_over_from_a_mode_that_steers_itself(mode):
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         begin(c, mode)
         sticks(c, y=100)
         c.run(0.5)
@@ -112,7 +114,7 @@ def test_a_quick_stick_takes_over_from_a_mode_that_steers_itself(mode):
 
 def test_a_quick_stick_takes_over_from_offboard_and_the_limit_is_obeyed():
     for limit, taken in ((1.0, True), (-1.0, False), (20.0, False)):
-        with Flight(start=IN_AIR, parameters={"MAN_OVERRIDE_SPD": limit}) as c:
+        with Flight(start=IN_AIR, parameters={"MAN_OVERRIDE_SPD": limit}, file=QUICK) as c:
             c.enter_offboard()
             for x in (0, 600):
                 stick = mavlink.MAVLink_manual_control_message(1, x, 0, 500, 0, 0)
@@ -123,14 +125,14 @@ def test_a_quick_stick_takes_over_from_offboard_and_the_limit_is_obeyed():
 
 
 def test_sticks_that_are_switched_off_or_gone_do_nothing():
-    with Flight(start=IN_AIR, parameters={"COM_RC_IN_MODE": 4}) as c:
+    with Flight(start=IN_AIR, parameters={"COM_RC_IN_MODE": 4}, file=QUICK) as c:
         sticks(c)
         c.run(0.2)
         assert c.set_mode(POSITION) == 1
         sticks(c, y=1000)
         c.run(0.5)
         assert c.mode == HOLD
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         begin(c, POSITION)
         c.each = None
         c.until(lambda: c.mode != POSITION, 1.5)
@@ -145,12 +147,12 @@ def test_a_radio_is_reported_and_flies_where_it_is_allowed():
         rest = (65535,) * (8 - len(channels))
         c.each = lambda: c.send(mavlink.MAVLink_rc_channels_override_message(1, 1, *channels, *rest))
 
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         assert c.request("RC_CHANNELS") == 2, "nothing yet"
         radio(c, 1500, 1500, 1500, 1500)
         c.run(0.3)
         assert c.set_mode(POSITION) == 1, "COM_RC_IN_MODE 1 is the joystick alone"
-    with Flight(start=IN_AIR, parameters={"COM_RC_IN_MODE": 0}) as c:
+    with Flight(start=IN_AIR, parameters={"COM_RC_IN_MODE": 0}, file=QUICK) as c:
         radio(c, 1500, 1500, 1500, 1500)
         c.run(0.3)
         assert c.set_mode(STABILIZED) == 0
@@ -165,7 +167,7 @@ def test_a_radio_is_reported_and_flies_where_it_is_allowed():
 
 def test_version_1_13_asks_another_parameter_about_sticks():
     for override, taken in ((1, True), (0, False)):
-        with Flight(start=IN_AIR, px4="1.13", parameters={"COM_RC_OVERRIDE": override}) as c:
+        with Flight(start=IN_AIR, px4="1.13", parameters={"COM_RC_OVERRIDE": override}, file=QUICK) as c:
             begin(c, HOLD)
             sticks(c, y=1000)
             c.run(0.5)
@@ -173,7 +175,7 @@ def test_version_1_13_asks_another_parameter_about_sticks():
 
 
 def test_nobody_takes_over_on_the_ground():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         begin(c, TAKEOFF)
         sticks(c, y=1000)
         c.run(0.5)

@@ -3,10 +3,12 @@
 import math
 
 import pytest
-from vehicle_tools import HOLD, IN_AIR, OFFBOARD, Flight, mavlink
+from vehicle_tools import HOLD, IN_AIR, OFFBOARD, Flight, mavlink, vehicle_file
 
 from sim_link.geodesy import global_position
 
+# Few states and few steps a second: what is looked at here is slow.
+QUICK = vehicle_file(25.0, loop_rate_hz=250.0)
 NONE = (0.0, 0.0, 0.0)
 POSITION = 0b110111111000  # position, yaw
 VELOCITY = 0b110111000111
@@ -41,7 +43,7 @@ def heading(c):
 
 
 def test_position_velocity_and_acceleration_are_flown():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         enter(c, POSITION & ~YAW, p=(3.0, -2.0, -21.0), yaw=1.0)
         c.run(8.0)
         assert c.position == pytest.approx((3.0, -2.0, -21.0), abs=0.1)
@@ -62,7 +64,7 @@ def test_acceleration_feeds_forward_along_a_circle():
     """With position, velocity and acceleration of a circle the error is a fraction of that with the position alone."""
 
     def error(mask):
-        with Flight(start=((2.0, 0.0, -20.0), 0.0)) as c:
+        with Flight(start=((2.0, 0.0, -20.0), 0.0), file=QUICK) as c:
 
             def send():
                 angle = 0.8 * (c.t_us * 1e-6)
@@ -93,14 +95,14 @@ def test_acceleration_feeds_forward_along_a_circle():
 
 
 def test_acceleration_alone_tilts():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         enter(c, ACCELERATION, a=(2.0, 0.0, 0.0))
         c.run(1.5)
         assert c.tilt == pytest.approx(math.atan(2.0 / 9.81), abs=0.03)
 
 
 def test_global_positions_are_flown_too():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         latitude, longitude, altitude = global_position((4.0, 3.0, -22.0))
         message = mavlink.MAVLink_set_position_target_global_int_message
         c.each = lambda: c.send(message(0, 1, 1, 5, POSITION, latitude, longitude, altitude, *[0.0] * 8))
@@ -114,7 +116,7 @@ def test_global_positions_are_flown_too():
 
 
 def test_it_takes_off_with_a_ramp_and_lands():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         stream(c, POSITION, p=(0.0, 0.0, -3.0))
         c.run(0.1)
         assert c.set_mode(OFFBOARD) == 0
@@ -131,7 +133,7 @@ def test_it_takes_off_with_a_ramp_and_lands():
 
 
 def test_on_the_ground_a_trajectory_that_does_not_lead_up_is_not_flown():
-    with Flight() as c:
+    with Flight(file=QUICK) as c:
         stream(c, POSITION, p=(1.0, 0.0, 0.0))
         c.run(0.1)
         assert c.set_mode(OFFBOARD) == 0
@@ -152,7 +154,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("fields", "word"), REFUSED)
 def test_what_is_refused_is_no_sign_of_life(fields, word):
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         fields = dict(fields)
         mask = fields.pop("mask")
         stream(c, mask, **fields)
@@ -162,7 +164,7 @@ def test_what_is_refused_is_no_sign_of_life(fields, word):
 
 
 def test_for_others_it_is_nothing_at_all():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         for to in ((2, 1), (1, 42)):
             stream(c, POSITION, to=to)
             c.run(0.2)
@@ -173,7 +175,7 @@ def test_for_others_it_is_nothing_at_all():
 
 
 def test_an_incomplete_trajectory_stops_the_vehicle_and_a_lost_one_is_a_failsafe():
-    with Flight(start=IN_AIR, parameters={"COM_OBL_RC_ACT": 5}) as c:
+    with Flight(start=IN_AIR, parameters={"COM_OBL_RC_ACT": 5}, file=QUICK) as c:
         enter(c, VELOCITY, v=(2.0, 0.0, 0.0))
         c.run(3.0)
         assert velocity(c)[0] > 1.7
@@ -188,7 +190,7 @@ def test_an_incomplete_trajectory_stops_the_vehicle_and_a_lost_one_is_a_failsafe
 
 
 def test_another_type_takes_up_to_half_a_second():
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         enter(c, POSITION, p=(0.0, 0.0, -20.0))
         c.run(1.0)
         c.stream(128, rates=(0.0, 0.0, 1.0), thrust=0.49)
@@ -201,7 +203,7 @@ def test_another_type_takes_up_to_half_a_second():
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, 1e30, math.nan])
 def test_absurd_numbers_do_not_end_the_vehicle(value):
-    with Flight(start=IN_AIR) as c:
+    with Flight(start=IN_AIR, file=QUICK) as c:
         enter(c, 0b110000000000, p=(0.0, 0.0, -20.0), v=(value, 0.0, value), a=(0.0, value, value))
         c.run(1.0)
         stream(c, 0, p=(value, value, value), yaw=value, yaw_rate=value)
