@@ -87,6 +87,7 @@ class Peer:
         self.vehicle = vehicle
         self.options = options
         self.companion = UdpEndpoint(options.port, options.remote_port, "--port")
+        self.companion.together = options.lockstep
         self.ground: UdpEndpoint | None = None
         self._truth: UdpEndpoint | None = None
         try:
@@ -106,8 +107,6 @@ class Peer:
         self._stopped = stopped
         self._notice = notice
         self._endpoints = [self.companion] if self.ground is None else [self.companion, self.ground]
-        self._companion_poll = select.poll()
-        self._companion_poll.register(self.companion.fileno(), select.POLLIN)
         self._poll = select.poll()
         for endpoint in self._endpoints:
             self._poll.register(endpoint.fileno(), select.POLLIN)
@@ -229,14 +228,13 @@ class Peer:
 
     def _spin(self, limit_s: float) -> None:
         """Poll for the answer for a time; each datagram extends it a little, but never beyond the patience."""
-        poll, clock = self._companion_poll.poll, time.monotonic
+        receive, clock = self.companion.receive, time.monotonic
         end_s = clock() + limit_s
         give_up_s = self._ticked_s + PATIENCE_S
         while not self._answered:
-            if poll(0):
-                datagram = self.companion.receive()
-                if datagram is not None:
-                    self._act(*datagram)
+            datagram = receive()
+            if datagram is not None:
+                self._act(*datagram)
                 end_s = min(max(end_s, clock() + _SPIN_NEXT_S), give_up_s)
             elif clock() > end_s:
                 return

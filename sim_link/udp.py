@@ -10,6 +10,7 @@ from .codec import Frame, frames
 LOOPBACK = "127.0.0.1"
 _DATAGRAM_MAX = 2048
 _BUFFER_BYTES = 1 << 20
+_TOGETHER_MAX = 1400
 
 Address = tuple[str, int]
 
@@ -49,6 +50,8 @@ class UdpEndpoint:
         self.port: int = self.socket.getsockname()[1]
         self.partner: Address | None = None
         self._remote: Address | None = (LOOPBACK, remote_port) if remote_port else None
+        self.together = False
+        """Put several frames into one datagram, as far as a network takes it whole."""
         self.unsent = 0
         """Datagrams that the system did not take."""
 
@@ -61,7 +64,7 @@ class UdpEndpoint:
         address = self.partner or self._remote
         if address is not None:
             sendto = self.socket.sendto
-            for frame in outbox:
+            for frame in _joined(outbox) if self.together and len(outbox) > 1 else outbox:
                 try:
                     sendto(frame, address)
                 except OSError:
@@ -84,3 +87,14 @@ class UdpEndpoint:
     def close(self) -> None:
         """Give the port back."""
         self.socket.close()
+
+
+def _joined(outbox: list[bytes]) -> list[bytes]:
+    """Put frames together to datagrams of bounded size."""
+    datagrams = [outbox[0]]
+    for frame in outbox[1:]:
+        if len(datagrams[-1]) + len(frame) <= _TOGETHER_MAX:
+            datagrams[-1] += frame
+        else:
+            datagrams.append(frame)
+    return datagrams

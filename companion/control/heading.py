@@ -47,50 +47,67 @@ class Frame(NamedTuple):
 
 def unit_derivatives(f: Vec3, f1: Vec3, f2: Vec3) -> tuple[Vec3, Vec3, Vec3]:
     """u = f/|f| with its first two derivatives, from those of f; f must not be zero."""
-    k = 1.0 / math.sqrt(f[0] * f[0] + f[1] * f[1] + f[2] * f[2])
-    x, y, z = k * f[0], k * f[1], k * f[2]
-    n1 = x * f1[0] + y * f1[1] + z * f1[2]
-    x1, y1, z1 = k * (f1[0] - n1 * x), k * (f1[1] - n1 * y), k * (f1[2] - n1 * z)
-    n2 = x * f2[0] + y * f2[1] + z * f2[2] + x1 * f1[0] + y1 * f1[1] + z1 * f1[2]
+    a, b, c = f
+    a1, b1, c1 = f1
+    a2, b2, c2 = f2
+    k = 1.0 / math.sqrt(a * a + b * b + c * c)
+    x, y, z = k * a, k * b, k * c
+    n1 = x * a1 + y * b1 + z * c1
+    x1, y1, z1 = k * (a1 - n1 * x), k * (b1 - n1 * y), k * (c1 - n1 * z)
+    n2 = x * a2 + y * b2 + z * c2 + x1 * a1 + y1 * b1 + z1 * c1
     n1 = 2.0 * n1
     return (
         (x, y, z),
         (x1, y1, z1),
-        (k * (f2[0] - n2 * x - n1 * x1), k * (f2[1] - n2 * y - n1 * y1), k * (f2[2] - n2 * z - n1 * z1)),
+        (k * (a2 - n2 * x - n1 * x1), k * (b2 - n2 * y - n1 * y1), k * (c2 - n2 * z - n1 * z1)),
     )
 
 
-def desired_frame(r3d: tuple[Vec3, Vec3, Vec3], f: Vec3, f1: Vec3, f2: Vec3) -> Frame:
+def unit_rate(f: Vec3, f1: Vec3) -> tuple[Vec3, Vec3]:
+    """u = f/|f| with its first derivative; f must not be zero."""
+    a, b, c = f
+    a1, b1, c1 = f1
+    k = 1.0 / math.sqrt(a * a + b * b + c * c)
+    x, y, z = k * a, k * b, k * c
+    n = x * a1 + y * b1 + z * c1
+    return (x, y, z), (k * (a1 - n * x), k * (b1 - n * y), k * (c1 - n * z))
+
+
+def desired_frame(force: tuple[Vec3, Vec3, Vec3], r3d: tuple[Vec3, Vec3], f: Vec3, f1: Vec3, f2: Vec3) -> Frame:
     """(40) and the yaw rate w3d = -r1d . r2d' that follows from R_d' = R_d S(w_d), with its derivative.
 
     Args:
-        r3d: the desired thrust direction and its first two derivatives.
+        force: F/m and its first two derivatives; only their direction counts.
+        r3d: the desired thrust direction F/|F| and its derivative (`unit_rate`).
         f: forward direction, not parallel to r3d; f1 and f2 its derivatives.
     """
-    (a, b, c), (a1, b1, c1), (a2, b2, c2) = r3d
-    # q = r3d x f and its derivatives, written out: this is the longest part of a control step
-    q = (b * f[2] - c * f[1], c * f[0] - a * f[2], a * f[1] - b * f[0])
+    (ax, ay, az), (ax1, ay1, az1), (ax2, ay2, az2) = force
+    fx, fy, fz = f
+    fx1, fy1, fz1 = f1
+    fx2, fy2, fz2 = f2
+    # r2d has the direction of F x f. With its derivatives, written out: this is the longest part of a control step
+    q = (ay * fz - az * fy, az * fx - ax * fz, ax * fy - ay * fx)
     q1 = (
-        b1 * f[2] - c1 * f[1] + b * f1[2] - c * f1[1],
-        c1 * f[0] - a1 * f[2] + c * f1[0] - a * f1[2],
-        a1 * f[1] - b1 * f[0] + a * f1[1] - b * f1[0],
+        ay1 * fz - az1 * fy + ay * fz1 - az * fy1,
+        az1 * fx - ax1 * fz + az * fx1 - ax * fz1,
+        ax1 * fy - ay1 * fx + ax * fy1 - ay * fx1,
     )
     q2 = (
-        b2 * f[2] - c2 * f[1] + 2.0 * (b1 * f1[2] - c1 * f1[1]) + b * f2[2] - c * f2[1],
-        c2 * f[0] - a2 * f[2] + 2.0 * (c1 * f1[0] - a1 * f1[2]) + c * f2[0] - a * f2[2],
-        a2 * f[1] - b2 * f[0] + 2.0 * (a1 * f1[1] - b1 * f1[0]) + a * f2[1] - b * f2[0],
+        ay2 * fz - az2 * fy + 2.0 * (ay1 * fz1 - az1 * fy1) + ay * fz2 - az * fy2,
+        az2 * fx - ax2 * fz + 2.0 * (az1 * fx1 - ax1 * fz1) + az * fx2 - ax * fz2,
+        ax2 * fy - ay2 * fx + 2.0 * (ax1 * fy1 - ay1 * fx1) + ax * fy2 - ay * fx2,
     )
-    y, y1, y2 = unit_derivatives(q, q1, q2)
-    # r1d = r2d x r3d and its derivative
-    x = (y[1] * c - y[2] * b, y[2] * a - y[0] * c, y[0] * b - y[1] * a)
-    x1 = (
-        y1[1] * c - y1[2] * b + y[1] * c1 - y[2] * b1,
-        y1[2] * a - y1[0] * c + y[2] * a1 - y[0] * c1,
-        y1[0] * b - y1[1] * a + y[0] * b1 - y[1] * a1,
-    )
-    w3d = -(x[0] * y1[0] + x[1] * y1[1] + x[2] * y1[2])
-    w3d_rate = -(x1[0] * y1[0] + x1[1] * y1[1] + x1[2] * y1[2] + x[0] * y2[0] + x[1] * y2[1] + x[2] * y2[2])
-    return Frame(x, y, y1, w3d, w3d_rate)
+    r2d, r2d_rate, r2d_acceleration = unit_derivatives(q, q1, q2)
+    (ux, uy, uz), (ux1, uy1, uz1) = r3d
+    yx, yy, yz = r2d
+    yx1, yy1, yz1 = r2d_rate
+    yx2, yy2, yz2 = r2d_acceleration
+    # r1d = r2d x r3d; of its derivative only r2d x r3d' has a share in r1d' . r2d'
+    xx, xy, xz = yy * uz - yz * uy, yz * ux - yx * uz, yx * uy - yy * ux
+    w3d = -(xx * yx1 + xy * yy1 + xz * yz1)
+    turned = (yy * uz1 - yz * uy1) * yx1 + (yz * ux1 - yx * uz1) * yy1 + (yx * uy1 - yy * ux1) * yz1
+    w3d_rate = -(turned + xx * yx2 + xy * yy2 + xz * yz2)
+    return Frame((xx, xy, xz), r2d, r2d_rate, w3d, w3d_rate)
 
 
 def limit_rate(frame: Frame, r3d: Vec3, last: Vec3, rate_max: float, dt_s: float) -> Frame:
@@ -135,12 +152,15 @@ def forward_direction(
         f1 = (-n * s, n * c, 0.0)
         f2 = (-n2 * s - n * n * c, n2 * c - n * n * s, 0.0)
         return f, f1, f2, HeadingState(memory.r2d, memory.forward, False), norm(cross(r3d, f))
-    v = ref.v
-    x, y, z = r3d[1] * v[2] - r3d[2] * v[1], r3d[2] * v[0] - r3d[0] * v[2], r3d[0] * v[1] - r3d[1] * v[0]
+    a, b, c = r3d
+    d, e, g = ref.v
+    x, y, z = b * g - c * e, c * d - a * g, a * e - b * d
     size = math.sqrt(x * x + y * y + z * z)
     threshold = 2.0 * speed_min if memory.held else speed_min
     if size > threshold:
-        return ref.v, ref.a, ref.j, HeadingState(memory.r2d, memory.forward, False), size
+        if memory.held:
+            memory = HeadingState(memory.r2d, memory.forward, False)
+        return ref.v, ref.a, ref.j, memory, size
     forward = memory.forward
     if not memory.held:
         forward = cross(memory.r2d, r3d)
@@ -179,17 +199,20 @@ def heading_torque(
     x, y, z = force[0]
     if kind == DAMPING or x * x + y * y + z * z < FORCE_MIN_M_S2 * FORCE_MIN_M_S2:
         return -damping * w3, memory, math.nan
-    r3d = unit_derivatives(force[0], force[1], force[2])
+    r3d = unit_rate(force[0], force[1])
     f, f1, f2, memory, size = forward_direction(ref, r3d[0], memory, kind, limits[1])
     if size < 1e-6:
         return -damping * w3, memory, math.nan
-    frame = desired_frame(r3d, f, f1, f2)
+    frame = desired_frame(force, r3d, f, f1, f2)
     if dt_s > 0.0:
         frame = limit_rate(frame, r3d[0], memory.r2d, limits[0], dt_s)
-    r1, r2, r3 = body
-    along = dot(frame.r2d, r1)
+    r1d, r2d, (a1, b1, c1), w3d, w3d_rate = frame
+    (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = body
+    a, b, c = r2d
+    along = a * r10 + b * r11 + c * r12
     # d/dt(r2d . r1) = r2d' . r1 + r2d . (w3 r2 - w2 r3)
-    along_rate = dot(frame.r2d_rate, r1) + w3 * dot(frame.r2d, r2) - w2 * dot(frame.r2d, r3)
-    tau3 = -l2 * (w3 - frame.w3d + l1 * along) + frame.w3d_rate - l1 * along_rate
-    error = math.atan2(along, dot(frame.r1d, r1))
-    return tau3, HeadingState(frame.r2d, memory.forward, memory.held), error
+    turning = a * (w3 * r20 - w2 * r30) + b * (w3 * r21 - w2 * r31) + c * (w3 * r22 - w2 * r32)
+    along_rate = a1 * r10 + b1 * r11 + c1 * r12 + turning
+    tau3 = -l2 * (w3 - w3d + l1 * along) + w3d_rate - l1 * along_rate
+    error = math.atan2(along, r1d[0] * r10 + r1d[1] * r11 + r1d[2] * r12)
+    return tau3, HeadingState(r2d, memory.forward, memory.held), error

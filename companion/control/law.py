@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from companion.control.heading import HeadingState, heading_torque
 from companion.control.types import Quat, Reference, State, Vec3
-from companion.control.vectors import axes, cross, dot, norm
+from companion.control.vectors import axes, cross, norm
 
 LIMIT_THRUST_MIN = 1
 LIMIT_THRUST_MAX = 2
@@ -162,34 +162,33 @@ def errors(
 ) -> Errors:
     """The errors e1 to e4 of equations (8), (25), (30), (15), and sigma(e1) of (26)."""
     k1 = gains.k1
-    c0 = 1.0 / (k1 * k1 * gains.k2)
+    per_k1 = 1.0 / k1
+    c0 = per_k1 * per_k1 / gains.k2
     c1 = c0 / (k1 * gains.k2 + gains.k3)
-    r1, r2, r3 = axes(state.q)
+    (p0, p1, p2), (v0, v1, v2), q, (w1, w2, _) = state
+    (pd0, pd1, pd2), (vd0, vd1, vd2), (ad0, ad1, ad2), (jd0, jd1, jd2), _, _, _, _ = ref
+    (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = axes(q)
+    b0, b1, b2 = b_hat
     t_m = thrust / model.mass
     td_m = thrust_rate / model.mass
     d = model.drag
-    w1, w2, _ = state.w
 
-    x, y, z = state.p[0] - ref.p[0], state.p[1] - ref.p[1], state.p[2] - ref.p[2]
+    x, y, z = p0 - pd0, p1 - pd1, p2 - pd2
     size = math.sqrt(x * x + y * y + z * z)
     bound = gains.p_max / size if size > gains.p_max else 1.0
-    s = (bound * x, bound * y, bound * z)
+    s0, s1, s2 = bound * x, bound * y, bound * z
 
-    e2 = (s[0] + (state.v[0] - ref.v[0]) / k1, s[1] + (state.v[1] - ref.v[1]) / k1, s[2] + (state.v[2] - ref.v[2]) / k1)
+    e20, e21, e22 = s0 + per_k1 * (v0 - vd0), s1 + per_k1 * (v1 - vd1), s2 + per_k1 * (v2 - vd2)
     # a = g u3 - (T/m) r3 + b_hat - q2
-    e3 = (
-        e2[0] + c0 * (b_hat[0] - t_m * r3[0] - ref.a[0] - d * ref.v[0]),
-        e2[1] + c0 * (b_hat[1] - t_m * r3[1] - ref.a[1] - d * ref.v[1]),
-        e2[2] + c0 * (b_hat[2] - t_m * r3[2] - ref.a[2] - d * ref.v[2] + model.gravity),
-    )
+    e30 = e20 + c0 * (b0 - t_m * r30 - ad0 - d * vd0)
+    e31 = e21 + c0 * (b1 - t_m * r31 - ad1 - d * vd1)
+    e32 = e22 + c0 * (b2 - t_m * r32 - ad2 - d * vd2 + model.gravity)
     # j = -(T'/m) r3 - (T/m) R S(w) u3 - q3, with R S(w) u3 = w2 r1 - w1 r2
     f1, f2 = -t_m * w2, t_m * w1
-    e4 = (
-        e3[0] + c1 * (f1 * r1[0] + f2 * r2[0] - td_m * r3[0] - ref.j[0] - d * ref.a[0]),
-        e3[1] + c1 * (f1 * r1[1] + f2 * r2[1] - td_m * r3[1] - ref.j[1] - d * ref.a[1]),
-        e3[2] + c1 * (f1 * r1[2] + f2 * r2[2] - td_m * r3[2] - ref.j[2] - d * ref.a[2]),
-    )
-    return Errors((x, y, z), e2, e3, e4, s)
+    e40 = e30 + c1 * (f1 * r10 + f2 * r20 - td_m * r30 - jd0 - d * ad0)
+    e41 = e31 + c1 * (f1 * r11 + f2 * r21 - td_m * r31 - jd1 - d * ad1)
+    e42 = e32 + c1 * (f1 * r12 + f2 * r22 - td_m * r32 - jd2 - d * ad2)
+    return Errors((x, y, z), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), (s0, s1, s2))
 
 
 def estimator_rate(e: Errors, b_hat: Vec3, gamma: float, bound: float) -> Vec3:
@@ -198,16 +197,16 @@ def estimator_rate(e: Errors, b_hat: Vec3, gamma: float, bound: float) -> Vec3:
     In the outer PROJECTION_LAYER of the ball the outward part fades out smoothly. As long as the true value lies inside
     that layer (|b/m| <= 0.9 B), the projection only adds a non-positive term to V'.
     """
-    x = gamma * (e.e2[0] + e.e3[0] + e.e4[0])
-    y = gamma * (e.e2[1] + e.e3[1] + e.e4[1])
-    z = gamma * (e.e2[2] + e.e3[2] + e.e4[2])
-    size_sq = b_hat[0] * b_hat[0] + b_hat[1] * b_hat[1] + b_hat[2] * b_hat[2]
+    _, (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
+    b0, b1, b2 = b_hat
+    x, y, z = gamma * (e20 + e30 + e40), gamma * (e21 + e31 + e41), gamma * (e22 + e32 + e42)
+    size_sq = b0 * b0 + b1 * b1 + b2 * b2
     inner = (1.0 - PROJECTION_LAYER) * bound
-    outward = b_hat[0] * x + b_hat[1] * y + b_hat[2] * z
+    outward = b0 * x + b1 * y + b2 * z
     if size_sq > inner * inner and outward > 0.0:
         share = min(1.0, (size_sq - inner * inner) / (bound * bound - inner * inner))
         cut = share * outward / size_sq
-        return (x - cut * b_hat[0], y - cut * b_hat[1], z - cut * b_hat[2])
+        return (x - cut * b0, y - cut * b1, z - cut * b2)
     return (x, y, z)
 
 
@@ -221,32 +220,31 @@ def error_rates(e: Errors, e1_rate: Vec3, b_hat_rate: Vec3, gains: Gains, drag: 
         gains: the gain set.
         drag: D [1/s].
     """
-    k1, k2, k3, k4 = gains.k1, gains.k2, gains.k3, gains.k4
+    k1, k2, k3, k4, _, p_max, _, _, _, _ = gains
+    (x, y, z), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
+    x1, y1, z1 = e1_rate
     c0 = 1.0 / (k1 * k1 * k2)
     # Ds e1' is the rate of sigma: all of e1' inside, its tangential part shrunk by p_max/|e1| outside.
-    size_sq = e.e1[0] * e.e1[0] + e.e1[1] * e.e1[1] + e.e1[2] * e.e1[2]
+    size_sq = x * x + y * y + z * z
     radial = 0.0
     bound = 1.0
-    if size_sq > gains.p_max * gains.p_max:
-        bound = gains.p_max / math.sqrt(size_sq)
-        radial = dot(e.e1, e1_rate) / size_sq
+    if size_sq > p_max * p_max:
+        bound = p_max / math.sqrt(size_sq)
+        radial = (x * x1 + y * y1 + z * z1) / size_sq
     kk = k1 * k2
     ks = kk + k3
+    share = drag / k1
     # per axis; -D e1'/k1 is the drag's share
-    e2r0 = bound * (e1_rate[0] - radial * e.e1[0]) - drag * e1_rate[0] / k1 + kk * (e.e3[0] - e.e2[0])
-    e2r1 = bound * (e1_rate[1] - radial * e.e1[1]) - drag * e1_rate[1] / k1 + kk * (e.e3[1] - e.e2[1])
-    e2r2 = bound * (e1_rate[2] - radial * e.e1[2]) - drag * e1_rate[2] / k1 + kk * (e.e3[2] - e.e2[2])
-    g0 = e2r0 + ks * (e.e4[0] - e.e3[0])
-    g1 = e2r1 + ks * (e.e4[1] - e.e3[1])
-    g2 = e2r2 + ks * (e.e4[2] - e.e3[2])
+    d0, d1, d2 = kk * (e30 - e20), kk * (e31 - e21), kk * (e32 - e22)
+    e2r0 = bound * (x1 - radial * x) - share * x1 + d0
+    e2r1 = bound * (y1 - radial * y) - share * y1 + d1
+    e2r2 = bound * (z1 - radial * z) - share * z1 + d2
+    g0, g1, g2 = e2r0 + ks * (e40 - e30), e2r1 + ks * (e41 - e31), e2r2 + ks * (e42 - e32)
+    k4s = ks + k4
     return (
         (e2r0, e2r1, e2r2),
         (g0 + c0 * b_hat_rate[0], g1 + c0 * b_hat_rate[1], g2 + c0 * b_hat_rate[2]),
-        (
-            g0 - kk * (e.e3[0] - e.e2[0]) - (ks + k4) * e.e4[0],
-            g1 - kk * (e.e3[1] - e.e2[1]) - (ks + k4) * e.e4[1],
-            g2 - kk * (e.e3[2] - e.e2[2]) - (ks + k4) * e.e4[2],
-        ),
+        (g0 - d0 - k4s * e40, g1 - d1 - k4s * e41, g2 - d2 - k4s * e42),
     )
 
 
@@ -265,34 +263,31 @@ def thrust_and_torque(
     Divides by max(T, thrust_min): below that the law is not defined, and the thrust limit keeps the flight away from
     there.
     """
-    gains, model = parameters.gains, parameters.model
-    k1 = gains.k1
-    c0 = 1.0 / (k1 * k1 * gains.k2)
-    kk = k1 * gains.k2
-    ks = kk + gains.k3
+    gains, model, limits = parameters
+    k1, k2, k3, k4, _, _, _, _, _, _ = gains
+    kk = k1 * k2
+    ks = kk + k3
+    k_sum = ks + k4
+    c0 = 1.0 / (k1 * kk)
     c1 = c0 / ks
-    k_sum = ks + gains.k4
     d = model.drag
-    r1, r2, r3 = body
+    (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = body
     w1, w2, w3 = w
-    # S(w) (S(w) T u3 + 2 T' u3) of (19), in body coordinates, where S(w) u3 = (w2, -w1, 0); its factor c1/m cancels in
-    # (34)
-    gyro = (
-        thrust * w3 * w1 + 2.0 * thrust_rate * w2,
-        thrust * w3 * w2 - 2.0 * thrust_rate * w1,
-        -thrust * (w1 * w1 + w2 * w2),
-    )
-    # h (19) without that term, plus c0 b_hat' (34); q4 = p_d'''' + D p_d'''
-    h = (
-        kk * (e.e3[0] - e.e2[0]) + k_sum * e.e4[0] - c1 * (ref.s[0] + d * ref.j[0]) + c0 * b_hat_rate[0],
-        kk * (e.e3[1] - e.e2[1]) + k_sum * e.e4[1] - c1 * (ref.s[1] + d * ref.j[1]) + c0 * b_hat_rate[1],
-        kk * (e.e3[2] - e.e2[2]) + k_sum * e.e4[2] - c1 * (ref.s[2] + d * ref.j[2]) + c0 * b_hat_rate[2],
-    )
+    _, (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
+    j0, j1, j2 = ref.j
+    s0, s1, s2 = ref.s
+    # h (19) without its gyroscopic term, plus c0 b_hat' (34); q4 = p_d'''' + D p_d'''
+    h0 = kk * (e30 - e20) + k_sum * e40 - c1 * (s0 + d * j0) + c0 * b_hat_rate[0]
+    h1 = kk * (e31 - e21) + k_sum * e41 - c1 * (s1 + d * j1) + c0 * b_hat_rate[1]
+    h2 = kk * (e32 - e22) + k_sum * e42 - c1 * (s2 + d * j2) + c0 * b_hat_rate[2]
     m_c1 = model.mass / c1
-    y0 = -m_c1 * dot(r1, h) + gyro[0]
-    y1 = -m_c1 * dot(r2, h) + gyro[1]
-    y2 = -m_c1 * dot(r3, h) + gyro[2]
-    divisor = max(thrust, parameters.limits.thrust_min)
+    # S(w) (S(w) T u3 + 2 T' u3) of (19), in body coordinates, where S(w) u3 = (w2, -w1, 0), is added to R'h; its factor
+    # c1/m cancels in (34)
+    t_w3, two_t_rate = thrust * w3, 2.0 * thrust_rate
+    y0 = t_w3 * w1 + two_t_rate * w2 - m_c1 * (r10 * h0 + r11 * h1 + r12 * h2)
+    y1 = t_w3 * w2 - two_t_rate * w1 - m_c1 * (r20 * h0 + r21 * h1 + r22 * h2)
+    y2 = -thrust * (w1 * w1 + w2 * w2) - m_c1 * (r30 * h0 + r31 * h1 + r32 * h2)
+    divisor = max(thrust, limits.thrust_min)
     return (-y2, y1 / divisor, -y0 / divisor)
 
 
@@ -309,47 +304,42 @@ def evaluate(
         frozen: the estimator stands still (thrust at a limit, on the ground, stale state).
         dt_s: sample interval for the heading's rate limit [s]; 0 for the continuous form, which has none.
     """
-    gains, model, limits = parameters.gains, parameters.model, parameters.limits
-    body = axes(state.q)
-    e = errors(state, ref, controller.thrust, controller.thrust_rate, controller.b_hat, gains, model)
+    gains, model, limits = parameters
+    thrust, thrust_rate, b_hat, memory, _ = controller
+    _, v, q, w = state
+    _, vd, ad, jd, sd, _, _, _ = ref
+    gamma, d = gains.gamma, model.drag
+    body = axes(q)
+    e = errors(state, ref, thrust, thrust_rate, b_hat, gains, model)
     b_hat_rate = (0.0, 0.0, 0.0)
     b_hat_acceleration = (0.0, 0.0, 0.0)
-    if not frozen and gains.gamma > 0.0:
-        b_hat_rate = estimator_rate(e, controller.b_hat, gains.gamma, limits.disturbance_max)
-    # b_hat'' is needed by the heading only, and is left out while the projection bends b_hat'
-    if not frozen and gains.gamma > 0.0 and b_hat_rate[0] == gains.gamma * (e.e2[0] + e.e3[0] + e.e4[0]):
-        e1_rate = (state.v[0] - ref.v[0], state.v[1] - ref.v[1], state.v[2] - ref.v[2])
-        e2r, e3r, e4r = error_rates(e, e1_rate, b_hat_rate, gains, model.drag)
-        b_hat_acceleration = (
-            gains.gamma * (e2r[0] + e3r[0] + e4r[0]),
-            gains.gamma * (e2r[1] + e3r[1] + e4r[1]),
-            gains.gamma * (e2r[2] + e3r[2] + e4r[2]),
-        )
-    thrust_acceleration, tau1, tau2 = thrust_and_torque(
-        e, b_hat_rate, body, state.w, ref, controller.thrust, controller.thrust_rate, parameters
-    )
-    b, d = controller.b_hat, model.drag
+    if not frozen and gamma > 0.0:
+        b_hat_rate = estimator_rate(e, b_hat, gamma, limits.disturbance_max)
+        # b_hat'' is needed by the heading only, and is left out while the projection bends b_hat'
+        if b_hat_rate[0] == gamma * (e.e2[0] + e.e3[0] + e.e4[0]):
+            e1_rate = (v[0] - vd[0], v[1] - vd[1], v[2] - vd[2])
+            e2r, e3r, e4r = error_rates(e, e1_rate, b_hat_rate, gains, d)
+            b_hat_acceleration = (
+                gamma * (e2r[0] + e3r[0] + e4r[0]),
+                gamma * (e2r[1] + e3r[1] + e4r[1]),
+                gamma * (e2r[2] + e3r[2] + e4r[2]),
+            )
+    thrust_acceleration, tau1, tau2 = thrust_and_torque(e, b_hat_rate, body, w, ref, thrust, thrust_rate, parameters)
     # F/m = g u3 + b_hat - q2 and its derivatives: the direction that the thrust will have with no error (41)
-    force = (
-        b[0] - ref.a[0] - d * ref.v[0],
-        b[1] - ref.a[1] - d * ref.v[1],
-        b[2] - ref.a[2] - d * ref.v[2] + model.gravity,
-    )
-    force_rate = (
-        b_hat_rate[0] - ref.j[0] - d * ref.a[0],
-        b_hat_rate[1] - ref.j[1] - d * ref.a[1],
-        b_hat_rate[2] - ref.j[2] - d * ref.a[2],
-    )
+    x, y, z = ad
+    x1, y1, z1 = jd
+    force = (b_hat[0] - x - d * vd[0], b_hat[1] - y - d * vd[1], b_hat[2] - z - d * vd[2] + model.gravity)
+    force_rate = (b_hat_rate[0] - x1 - d * x, b_hat_rate[1] - y1 - d * y, b_hat_rate[2] - z1 - d * z)
     force_acceleration = (
-        b_hat_acceleration[0] - ref.s[0] - d * ref.j[0],
-        b_hat_acceleration[1] - ref.s[1] - d * ref.j[1],
-        b_hat_acceleration[2] - ref.s[2] - d * ref.j[2],
+        b_hat_acceleration[0] - sd[0] - d * x1,
+        b_hat_acceleration[1] - sd[1] - d * y1,
+        b_hat_acceleration[2] - sd[2] - d * z1,
     )
     tau3, heading, heading_error = heading_torque(
         state,
         ref,
         (force, force_rate, force_acceleration),
-        controller.heading,
+        memory,
         gains.heading_kind,
         (gains.l1, gains.l2, gains.damping),
         (limits.heading_rate_max, limits.heading_speed_min),
@@ -385,69 +375,71 @@ def step(
     Returns:
         the command, the next controller state, and the evaluation behind it.
     """
-    model, limits = parameters.model, parameters.limits
-    at_limit = controller.thrust <= limits.thrust_min or controller.thrust >= limits.thrust_max
-    hold = frozen or at_limit
+    _, model, limits = parameters
+    thrust_min, thrust_max, (most_x, most_y, most_z), bound, _, _ = limits
+    thrust_now, thrust_rate_now, (b0, b1, b2), _, (lead_x, lead_y, lead_z) = controller
+    hold = frozen or thrust_now <= thrust_min or thrust_now >= thrust_max
     out = evaluate(state, ref, controller, parameters, hold, dt_s)
+    _, (b0_rate, b1_rate, b2_rate), thrust_acceleration, tau, heading, _ = out
     flags = 0
     if hold:
         flags |= LIMIT_ESTIMATOR_FROZEN
-    if out.heading.held:
+    if heading.held:
         flags |= LIMIT_HEADING_HELD
 
-    thrust = controller.thrust + dt_s * (controller.thrust_rate + 0.5 * dt_s * out.thrust_acceleration)
-    thrust_rate = controller.thrust_rate + dt_s * out.thrust_acceleration
-    if thrust <= limits.thrust_min:
-        thrust = limits.thrust_min
+    thrust = thrust_now + dt_s * (thrust_rate_now + 0.5 * dt_s * thrust_acceleration)
+    thrust_rate = thrust_rate_now + dt_s * thrust_acceleration
+    if thrust <= thrust_min:
+        thrust = thrust_min
         thrust_rate = max(0.0, thrust_rate)
         flags |= LIMIT_THRUST_MIN
-    elif thrust >= limits.thrust_max:
-        thrust = limits.thrust_max
+    elif thrust >= thrust_max:
+        thrust = thrust_max
         thrust_rate = min(0.0, thrust_rate)
         flags |= LIMIT_THRUST_MAX
-    b, b_rate = controller.b_hat, out.b_hat_rate
-    b_hat = (b[0] + dt_s * b_rate[0], b[1] + dt_s * b_rate[1], b[2] + dt_s * b_rate[2])
-    size_sq = b_hat[0] * b_hat[0] + b_hat[1] * b_hat[1] + b_hat[2] * b_hat[2]
-    bound = limits.disturbance_max
+    b0, b1, b2 = b0 + dt_s * b0_rate, b1 + dt_s * b1_rate, b2 + dt_s * b2_rate
+    size_sq = b0 * b0 + b1 * b1 + b2 * b2
     if size_sq > (1.0 - PROJECTION_LAYER) ** 2 * bound * bound:
         flags |= LIMIT_DISTURBANCE
         if size_sq > bound * bound:  # the last of the discretisation: the smooth projection has done the rest
             shrink = bound / math.sqrt(size_sq)
-            b_hat = (shrink * b_hat[0], shrink * b_hat[1], shrink * b_hat[2])
-    w, tau, lag, most = state.w, out.tau, model.rate_lag, limits.rate_max
-    x = rate_setpoint(w[0], tau[0], lag[0], dt_s)
-    y = rate_setpoint(w[1], tau[1], lag[1], dt_s)
-    z = rate_setpoint(w[2], tau[2], lag[2], dt_s)
-    if abs(x) > most[0] or abs(y) > most[1]:
-        over = max(abs(x) / most[0], abs(y) / most[1])
+            b0, b1, b2 = shrink * b0, shrink * b1, shrink * b2
+    (wx, wy, wz), lag = state.w, model.rate_lag
+    x = rate_setpoint(wx, tau[0], lag[0], dt_s)
+    y = rate_setpoint(wy, tau[1], lag[1], dt_s)
+    z = rate_setpoint(wz, tau[2], lag[2], dt_s)
+    if abs(x) > most_x or abs(y) > most_y:
+        over = max(abs(x) / most_x, abs(y) / most_y)
         x, y = x / over, y / over
         flags |= LIMIT_ROLL_PITCH_RATE
-    if abs(z) > most[2]:
-        z = math.copysign(most[2], z)
+    if abs(z) > most_z:
+        z = math.copysign(most_z, z)
         flags |= LIMIT_YAW_RATE
-    lead, k = controller.lead_integral, model.rate_integral
-    rates = (
-        min(max(x - k[0] * lead[0], -most[0]), most[0]),
-        min(max(y - k[1] * lead[1], -most[1]), most[1]),
-        min(max(z - k[2] * lead[2], -most[2]), most[2]),
-    )
+    kx, ky, kz = model.rate_integral
+    rx, ry, rz = x - kx * lead_x, y - ky * lead_y, z - kz * lead_z
+    if abs(rx) > most_x:
+        rx = math.copysign(most_x, rx)
+    if abs(ry) > most_y:
+        ry = math.copysign(most_y, ry)
+    if abs(rz) > most_z:
+        rz = math.copysign(most_z, rz)
     # The autopilot integrates every lead w_cmd - w. All of it must not be taken back out: what a constant torque
     # disturbance leaves is the integral's own business, so the memory fades.
     lead = (
-        lead[0] + dt_s * (x - w[0] - (k[0] + LEAD_FADE_1_S) * lead[0]),
-        lead[1] + dt_s * (y - w[1] - (k[1] + LEAD_FADE_1_S) * lead[1]),
-        lead[2] + dt_s * (z - w[2] - (k[2] + LEAD_FADE_1_S) * lead[2]),
+        lead_x + dt_s * (x - wx - (kx + LEAD_FADE_1_S) * lead_x),
+        lead_y + dt_s * (y - wy - (ky + LEAD_FADE_1_S) * lead_y),
+        lead_z + dt_s * (z - wz - (kz + LEAD_FADE_1_S) * lead_z),
     )
     # the same inversion for the rotors' lag: the setpoint that brings the thrust to T at the end of the interval
-    ahead = rate_setpoint(controller.thrust, (thrust - controller.thrust) / dt_s, model.thrust_lag, dt_s)
-    if ahead > limits.thrust_max:
-        ahead = limits.thrust_max
+    ahead = rate_setpoint(thrust_now, (thrust - thrust_now) / dt_s, model.thrust_lag, dt_s)
+    if ahead > thrust_max:
+        ahead = thrust_max
         flags |= LIMIT_THRUST_MAX
-    elif ahead < limits.thrust_min:
-        ahead = limits.thrust_min
+    elif ahead < thrust_min:
+        ahead = thrust_min
         flags |= LIMIT_THRUST_MIN
-    command = Command(ahead, rates, (x, y, z), tau, flags)
-    return command, ControllerState(thrust, thrust_rate, b_hat, out.heading, lead), out
+    command = Command(ahead, (rx, ry, rz), (x, y, z), tau, flags)
+    return command, ControllerState(thrust, thrust_rate, (b0, b1, b2), heading, lead), out
 
 
 def start(thrust: float, q: Quat, mass: float, gravity: float, bound: float) -> tuple[float, Vec3]:
@@ -463,9 +455,11 @@ def start(thrust: float, q: Quat, mass: float, gravity: float, bound: float) -> 
 
 def lyapunov(e: Errors, p_max: float) -> float:
     """V_H of docs/law.md section 4 without its b_tilde term, which nobody can measure [m^2]."""
-    size = norm(e.e1)
-    potential = 0.5 * size * size if size <= p_max else p_max * size - 0.5 * p_max * p_max
-    return potential + 0.5 * (dot(e.e2, e.e2) + dot(e.e3, e.e3) + dot(e.e4, e.e4))
+    (x, y, z), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
+    size_sq = x * x + y * y + z * z
+    potential = 0.5 * size_sq if size_sq <= p_max * p_max else p_max * math.sqrt(size_sq) - 0.5 * p_max * p_max
+    outer = e20 * e20 + e21 * e21 + e22 * e22 + e30 * e30 + e31 * e31 + e32 * e32
+    return potential + 0.5 * (outer + e40 * e40 + e41 * e41 + e42 * e42)
 
 
 def torque(tau: Vec3, w: Vec3, inertia: Vec3) -> Vec3:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from companion.control.types import State, Vec3
-from companion.control.vectors import quat_exp, quat_multiply, quat_normalise
+from companion.control.vectors import quat_exp, quat_normalise
 
 Lags = tuple[float, float, float, float]
 """Time constants of roll, pitch, yaw rate and thrust behind their setpoints [s]."""
@@ -70,19 +70,23 @@ def advance(
         the state and the thrust at the end; second order in dt.
     """
     mass, gravity, drag = vehicle
-    v, p = state.v, state.p
+    p, v, (a, b, c, d), (wx, wy, wz) = state
+    rx, ry, rz = rates
+    x0, x1, y0, y1, z0, z1, t0, t1 = lags
     # body rates and thrust: where the lag brings them, and their means on the way
-    x, y, z = state.w[0] - rates[0], state.w[1] - rates[1], state.w[2] - rates[2]
+    x, y, z = wx - rx, wy - ry, wz - rz
     gap = thrust - thrust_setpoint
-    turn = (
-        dt_s * (rates[0] + x * lags[1]),
-        dt_s * (rates[1] + y * lags[3]),
-        dt_s * (rates[2] + z * lags[5]),
+    w = (rx + x * x0, ry + y * y0, rz + z * z0)
+    half = 0.5 * (thrust_setpoint + gap * t1) / mass
+    r, i, j, k = quat_exp((dt_s * (rx + x * x1), dt_s * (ry + y * y1), dt_s * (rz + z * z1)))
+    e, f, g, h = quat_normalise(
+        (
+            a * r - b * i - c * j - d * k,
+            a * i + b * r + c * k - d * j,
+            a * j - b * k + c * r + d * i,
+            a * k + b * j - c * i + d * r,
+        )
     )
-    w = (rates[0] + x * lags[0], rates[1] + y * lags[2], rates[2] + z * lags[4])
-    half = 0.5 * (thrust_setpoint + gap * lags[7]) / mass
-    a, b, c, d = state.q
-    e, f, g, h = quat_normalise(quat_multiply(state.q, quat_exp(turn)))
     # the sum of the thrust directions r3 at both ends
     north = 2.0 * (b * d + a * c + f * h + e * g)
     east = 2.0 * (c * d - a * b + g * h - e * f)
@@ -90,7 +94,7 @@ def advance(
     a0 = b_hat[0] - drag * v[0] - half * north
     a1 = b_hat[1] - drag * v[1] - half * east
     a2 = b_hat[2] - drag * v[2] - half * down + gravity
-    k = 0.5 * dt_s * dt_s
-    position = (p[0] + dt_s * v[0] + k * a0, p[1] + dt_s * v[1] + k * a1, p[2] + dt_s * v[2] + k * a2)
+    s = 0.5 * dt_s * dt_s
+    position = (p[0] + dt_s * v[0] + s * a0, p[1] + dt_s * v[1] + s * a1, p[2] + dt_s * v[2] + s * a2)
     velocity = (v[0] + dt_s * a0, v[1] + dt_s * a1, v[2] + dt_s * a2)
-    return State(position, velocity, (e, f, g, h), w), thrust_setpoint + gap * lags[6]
+    return State(position, velocity, (e, f, g, h), w), thrust_setpoint + gap * t0

@@ -43,10 +43,14 @@ def norm(a: Vec3) -> float:
 def axes(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
     """The columns r1, r2, r3 of R(q): the body's axes in inertial coordinates."""
     w, x, y, z = q
+    x2, y2, z2 = x + x, y + y, z + z
+    xx, yy, zz = x * x2, y * y2, z * z2
+    xy, xz, yz = x * y2, x * z2, y * z2
+    wx, wy, wz = w * x2, w * y2, w * z2
     return (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
-        (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
+        (1.0 - yy - zz, xy + wz, xz - wy),
+        (xy - wz, 1.0 - xx - zz, yz + wx),
+        (xz + wy, yz - wx, 1.0 - xx - yy),
     )
 
 
@@ -78,7 +82,8 @@ def quat_multiply(a: Quat, b: Quat) -> Quat:
 
 def quat_exp(rotation: Vec3) -> Quat:
     """The unit quaternion of a rotation vector [rad]; exact, with the series near zero."""
-    half_sq = 0.25 * dot(rotation, rotation)
+    x, y, z = rotation
+    half_sq = 0.25 * (x * x + y * y + z * z)
     if half_sq < 1e-12:
         s = 0.5 * (1.0 - half_sq / 6.0)
         c = 1.0 - 0.5 * half_sq
@@ -86,13 +91,14 @@ def quat_exp(rotation: Vec3) -> Quat:
         half = math.sqrt(half_sq)
         s = 0.5 * math.sin(half) / half
         c = math.cos(half)
-    return (c, s * rotation[0], s * rotation[1], s * rotation[2])
+    return (c, s * x, s * y, s * z)
 
 
 def quat_normalise(q: Quat) -> Quat:
     """The unit quaternion in the direction of q; q must not be zero."""
-    s = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return (s * q[0], s * q[1], s * q[2], s * q[3])
+    w, x, y, z = q
+    s = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return (s * w, s * x, s * y, s * z)
 
 
 def clip(x: float, low: float, high: float) -> float:

@@ -25,6 +25,8 @@ TAP_OUT: Final = 3  # the numbers that a traffic log (.tlog) has for the directi
 
 COMPANION_COMPONENT: Final = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _READS_MAX = 256
+_DATAGRAM_MAX = 1400
+"""Several frames in one datagram stay within what a network takes whole."""
 
 
 class Wire:
@@ -55,6 +57,7 @@ class Wire:
         self._parser = FrameParser(self._formats, self.counters, guard)
         self._seq = 0
         self._leftover = b""
+        self._gathered: list[bytes] | None = None
         self._poll = select.poll()
         self._poll.register(transport.fileno(), select.POLLIN)
 
@@ -94,40 +97,48 @@ class Wire:
         Args:
             timeout_s: how long to wait for the first datagram.
             spin_s: look without sleeping for this long first: an answer that is due in less is not worth going to sleep
-                for, which costs more than the wait itself. For a vehicle in lockstep.
+                for, which costs more than the wait itself. For a vehicle in lockstep: what was found this way is one
+                datagram, after which nothing comes before it is answered.
 
         Raises:
             LinkError: the serial line is gone.
         """
         frames: list[Frame] = []
-        if not self._spin(spin_s) and not self._poll.poll(max(0.0, timeout_s) * 1e3):
-            return frames
         unknown: list[bytes] = []
-        for _ in range(_READS_MAX):
-            try:
-                got = self._transport.read()
-            except OSError:  # the network's report about something sent earlier; it says nothing about what comes
-                self.counters.unreachable += 1
-                continue
-            if got is None:
-                break
-            wall_ns = time.monotonic_ns()
-            if self._transport.stream:
-                self._parse_stream(got[0], wall_ns, frames, unknown)
-            else:
-                self._parse_datagram(got[0], got[1], wall_ns, frames, unknown)
+        if not self._spin(spin_s, frames, unknown):
+            if not self._poll.poll(max(0.0, timeout_s) * 1e3):
+                return frames
+            for _ in range(_READS_MAX):
+                if not self._read(frames, unknown):
+                    break
         if self._tap is not None:
             self._report(frames, unknown)
         return frames
 
-    def _spin(self, spin_s: float) -> bool:
-        """Look for a datagram without sleeping; True when one is there."""
+    def _read(self, frames: list[Frame], unknown: list[bytes]) -> bool:
+        """Use what is there to be read at once; False when there is nothing."""
+        try:
+            got = self._transport.read()
+        except OSError:  # the network's report about something sent earlier; it says nothing about what comes
+            self.counters.unreachable += 1
+            return True
+        if got is None:
+            return False
+        wall_ns = time.monotonic_ns()
+        if self._transport.stream:
+            self._parse_stream(got[0], wall_ns, frames, unknown)
+        else:
+            self._parse_datagram(got[0], got[1], wall_ns, frames, unknown)
+        return True
+
+    def _spin(self, spin_s: float, frames: list[Frame], unknown: list[bytes]) -> bool:
+        """Look for a datagram without sleeping; True when one was used."""
         if spin_s <= 0.0:
             return False
-        poll, now = self._poll.poll, time.monotonic_ns
+        read, now = self._read, time.monotonic_ns
         end_ns = now() + int(spin_s * 1e9)
         while now() < end_ns:
-            if poll(0):
+            if read(frames, unknown):
                 return True
         return False
 
@@ -169,7 +180,9 @@ class Wire:
         if known is None:
             raise ValueError(f"message {msgid} is not in the dialect")
         raw = build_frame(msgid, payload, self._seq, self.system_id, self.component_id, known.crc_extra, self._guard)
-        if not self._write(raw):
+        if self._gathered is not None:
+            self._gathered.append(raw)
+        elif not self._write(raw):
             self.counters.send_dropped += 1
             return False
         self._seq = (self._seq + 1) & 0xFF
@@ -177,6 +190,28 @@ class Wire:
         if self._tap is not None:
             self._tap(TAP_OUT, raw, time.monotonic_ns())
         return True
+
+    def gather(self) -> None:
+        """Keep what is sent from now on, for `release`: for a vehicle in lockstep, which waits for the last of it."""
+        self._gathered = []
+
+    def release(self) -> None:
+        """Send what was kept since `gather`, in datagrams of several frames (MAVLink allows that)."""
+        gathered, self._gathered = self._gathered, None
+        if not gathered:
+            return
+        datagram = gathered[0]
+        for raw in gathered[1:]:
+            if len(datagram) + len(raw) > _DATAGRAM_MAX:
+                self._write_gathered(datagram)
+                datagram = raw
+            else:
+                datagram += raw
+        self._write_gathered(datagram)
+
+    def _write_gathered(self, datagram: bytes) -> None:
+        if not self._write(datagram):
+            self.counters.send_dropped += 1
 
     def _write(self, raw: bytes) -> bool:
         """Write once; once more when what failed was an earlier datagram (that is how UDP reports "nobody listens")."""

@@ -1,10 +1,9 @@
 """Writes the link's traffic to `link.tlog` from a process of its own.
 
-The control process hands over every datagram through a pair of Unix sockets (SOCK_SEQPACKET: it keeps the borders of
-messages, and its end says that the other side is gone). Handing over never blocks: what finds no room is dropped and
-counted. The child has low priority, no socket but its end of the pair, and ignores the signals that end a command, so
-that neither Ctrl-C nor the death of the control process loses the log: it writes what was handed over and ends when
-the pair closes.
+The control process hands over every datagram through a ring in shared memory: no system call, nothing that blocks, and
+what finds no room is dropped and counted. A pair of Unix sockets says when the log begins and ends. The child has low
+priority, no socket but its end of the pair, and ignores the signals that end a command, so that neither Ctrl-C nor the
+death of the control process loses the log: it writes what was handed over and ends when the pair closes.
 """
 
 from __future__ import annotations
@@ -19,21 +18,22 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterable
+from io import FileIO
 from pathlib import Path
 from typing import Final
 
 from companion.errors import CompanionError, InputError
+from companion.record import ring
+from companion.record.ring import Entry, RingReader, RingWriter
 from companion.record.tlog import TLOG_FILE, encode_datagram
 
-_HEAD = struct.Struct("=qB")  # wall_ns, direction
 _REPORT = struct.Struct("=QQ")  # datagrams taken, datagrams dropped by the child
 _READY: Final = b"ready"
-_DATAGRAM_MAX: Final = 65536 + _HEAD.size
-_PAIR_BUFFER: Final = 8 << 20  # bytes asked for; the system gives what net.core.wmem_max allows
+_RING_BYTES: Final = 16 << 20  # a minute and more of a usual link, should the child get no processor
 _PENDING_MAX: Final = 64 << 20  # bytes that wait for a disk that does not answer
 _FLUSH_S: Final = 0.5
-_ROUND_S: Final = 0.004
-_IDLE_ROUNDS: Final = 250
+_ROUND_S: Final = 0.05
 _START_TIMEOUT_S: Final = 20.0
 _NICE: Final = 10
 
@@ -41,10 +41,11 @@ _NICE: Final = 10
 class Recorder:
     """The control process's handle on the recorder."""
 
-    def __init__(self, process: subprocess.Popen[bytes], link: socket.socket) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], link: socket.socket, writer: RingWriter) -> None:
         self._process = process
         self._link = link
-        self._send = link.send
+        self._writer = writer
+        self._put = writer.put
         self._closed = False
         self.dropped: int = 0
         """Datagrams that are not in the log, because the recorder was too slow or gone."""
@@ -76,21 +77,31 @@ class Recorder:
             ) from None
         epoch_minus_wall_ns = time.time_ns() - time.monotonic_ns()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PAIR_BUFFER)
-        with log, theirs:
-            # The package's own root as working directory: `-m` finds the package from there, installed or not, and the
-            # folder from which the command was called stays free.
-            process = subprocess.Popen(
-                [sys.executable, "-m", __name__, str(theirs.fileno()), str(log.fileno()), str(epoch_minus_wall_ns)],
-                pass_fds=(theirs.fileno(), log.fileno()),
-                cwd=Path(__file__).resolve().parents[2],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                start_new_session=True,
-            )
+        memory = ring.create(_RING_BYTES)
+        try:
+            writer = RingWriter(memory)
+            process = cls._spawn(theirs, log, memory, epoch_minus_wall_ns)
+        finally:
+            theirs.close()
+            log.close()
+            os.close(memory)
         _await_ready(process, ours)
         ours.setblocking(False)
-        return cls(process, ours)
+        return cls(process, ours, writer)
+
+    @staticmethod
+    def _spawn(link: socket.socket, log: FileIO, memory: int, epoch_minus_wall_ns: int) -> subprocess.Popen[bytes]:
+        # The package's own root as working directory: `-m` finds the package from there, installed or not, and the
+        # folder from which the command was called stays free.
+        inherited = (link.fileno(), log.fileno(), memory)
+        return subprocess.Popen(
+            [sys.executable, "-m", __name__, *map(str, inherited), str(epoch_minus_wall_ns)],
+            pass_fds=inherited,
+            cwd=Path(__file__).resolve().parents[2],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,
+        )
 
     def offer(self, direction: int, raw: bytes, wall_ns: int) -> None:
         """Hand over one datagram (on a serial line: whole frames). Never blocks, never raises for a lost one.
@@ -100,9 +111,7 @@ class Recorder:
             raw: the bytes on the link.
             wall_ns: time.monotonic_ns() when they came or went.
         """
-        try:
-            self._send(_HEAD.pack(wall_ns, direction) + raw)
-        except OSError:
+        if self._closed or not self._put(direction, raw, wall_ns):
             self.dropped += 1
 
     def close(self, timeout_s: float = 10.0) -> None:
@@ -110,23 +119,26 @@ class Recorder:
         if self._closed:
             return
         self._closed = True
+        lost = 0
         try:
             self._link.shutdown(socket.SHUT_WR)
             self._link.settimeout(timeout_s)
             report = self._link.recv(_REPORT.size)
             if len(report) == _REPORT.size:
                 self.recorded, lost = _REPORT.unpack(report)
-                self.dropped += lost
             code = self._process.wait(timeout_s)
             if code != 0 or self.recorded is None:
                 self.problem = f"{TLOG_FILE}: the recorder ended early (code {code}); the log is incomplete"
+                lost += self._writer.put_count - self._writer.taken
         except (TimeoutError, subprocess.TimeoutExpired):
             self.problem = f"{TLOG_FILE}: the recorder is still writing; wait before reading the log"
         except OSError as error:
             self.problem = f"{TLOG_FILE}: the recorder is gone ({error.strerror}); the log is incomplete"
+            lost = self._writer.put_count - self._writer.taken
             self._process.poll()
         finally:
             self._link.close()
+        self.dropped += lost
         if self.problem is None and self.dropped:
             self.problem = f"{TLOG_FILE}: {self.dropped} datagrams are missing, the recorder was too slow"
 
@@ -192,34 +204,24 @@ def _write_all(file: int, entries: bytearray) -> None:
         os.fdatasync(file)
 
 
-def _receive(link: socket.socket, writer: _DiskWriter, epoch_minus_wall_ns: int) -> tuple[int, int]:
-    """Take datagrams until the other side closes; returns how many were taken and how many of them dropped."""
-    taken = 0
+def _receive(link: socket.socket, reader: RingReader, writer: _DiskWriter, epoch_minus_wall_ns: int) -> int:
+    """Take datagrams until the other side closes; returns how many of them had to be dropped.
+
+    This process looks from time to time instead of waiting: handing over a datagram then wakes nobody and costs the
+    control process less.
+    """
     dropped = 0
-    idle_rounds = 0
-    while True:
-        # While traffic flows this process looks from time to time instead of waiting for it: handing over a datagram
-        # then wakes nobody and costs the control process less.
-        if idle_rounds > _IDLE_ROUNDS:
-            select.select([link], [], [])
-        time.sleep(_ROUND_S)
-        idle_rounds += 1
-        while True:
-            try:
-                message = link.recv(_DATAGRAM_MAX)
-            except BlockingIOError:
-                break
-            except OSError:
-                return taken, dropped
-            if not message:
-                return taken, dropped
-            idle_rounds = 0
-            wall_ns, direction = _HEAD.unpack_from(message)
+
+    def write(entries: Iterable[Entry]) -> None:
+        nonlocal dropped
+        for wall_ns, direction, raw in entries:
             epoch_us = (wall_ns + epoch_minus_wall_ns) // 1000
-            if writer.put(encode_datagram(message[_HEAD.size :], epoch_us, direction)):
-                taken += 1
-            else:
-                dropped += 1
+            dropped += not writer.put(encode_datagram(raw, epoch_us, direction))
+
+    while not select.select([link], [], [], _ROUND_S)[0]:
+        write(reader.take())
+    write(reader.take_rest())
+    return dropped
 
 
 def _lower_priority() -> None:
@@ -231,23 +233,23 @@ def _lower_priority() -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """The child: numbers of the inherited socket and file, and what turns monotonic into epoch nanoseconds."""
-    if len(arguments) != 3:
+    """The child: inherited socket, file and memory by number, and what turns monotonic into epoch nanoseconds."""
+    if len(arguments) != 4:
         print("This program is started by `companion`; it records the traffic of a flight.", file=sys.stderr)
         return 2
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     _lower_priority()
     log = int(arguments[1])
+    reader = RingReader(int(arguments[2]))
     with socket.socket(fileno=int(arguments[0])) as link:
-        link.setblocking(False)
         writer = _DiskWriter(log)
         with contextlib.suppress(OSError):  # the control process died meanwhile: the end of the pair follows
             link.send(_READY)
-        taken, dropped = _receive(link, writer, int(arguments[2]))
+        dropped = _receive(link, reader, writer, int(arguments[3]))
         writer.close()
         with contextlib.suppress(OSError):  # nobody listens when the control process died
-            link.send(_REPORT.pack(taken, dropped))
+            link.send(_REPORT.pack(reader.taken - dropped, dropped))
     return 0 if writer.error is None else 1
 
 

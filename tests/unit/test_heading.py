@@ -10,7 +10,7 @@ from law_cases import MASS, PAPER_GAINS, ZERO, eight, memory, numbers, parameter
 
 from companion.campaign.ideal import World, fly
 from companion.control import heading
-from companion.control.heading import COMMANDED, DAMPING, SIDESLIP, HeadingState, desired_frame, unit_derivatives
+from companion.control.heading import COMMANDED, DAMPING, SIDESLIP, HeadingState, desired_frame, unit_rate
 from companion.control.law import ControllerState
 from companion.control.types import Reference, State
 from companion.control.vectors import axes, cross, dot, norm, quat_exp
@@ -34,9 +34,9 @@ def test_yaw_rate_and_its_derivative_agree_with_finite_differences(force, forwar
 
     def frame(t):
         f = smooth(force, t)
-        return desired_frame(unit_derivatives(*f), *smooth(forward, t))
+        return desired_frame(f, unit_rate(f[0], f[1]), *smooth(forward, t))
 
-    if norm(cross(unit_derivatives(*smooth(force, 0.0))[0], smooth(forward, 0.0)[0])) < 0.3:
+    if norm(cross(unit_rate(*smooth(force, 0.0)[:2])[0], smooth(forward, 0.0)[0])) < 0.3:
         return
     h = 1e-5
     before, now, after = frame(-h), frame(0.0), frame(h)

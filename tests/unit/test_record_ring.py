@@ -1,0 +1,59 @@
+"""The ring between the control process and its recorder: nothing is lost that was taken, nothing is invented."""
+
+import os
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.record import ring
+from companion.record.ring import Entry, RingReader, RingWriter
+
+
+def make(size_bytes: int) -> tuple[RingWriter, RingReader]:
+    descriptor = ring.create(size_bytes)
+    try:
+        return RingWriter(descriptor), RingReader(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    size=st.integers(64, 600),
+    steps=st.lists(st.one_of(st.binary(max_size=90), st.sampled_from(["take", "rest"])), max_size=120),
+)
+def test_what_was_put_comes_out_once_and_in_order(size, steps):
+    writer, reader = make(size)
+    put: list[Entry] = []
+    got: list[Entry] = []
+    for number, step in enumerate(steps):
+        if isinstance(step, bytes):
+            if writer.put(number % 256, step, number):
+                put.append(Entry(number, number % 256, step))
+        else:
+            got.extend(reader.take() if step == "take" else reader.take_rest())
+            assert got == put[: len(got)]
+    got.extend(reader.take_rest())
+    assert got == put
+    assert writer.put_count == writer.taken == len(put)
+
+
+def test_an_entry_is_taken_only_at_the_look_after_the_one_that_saw_it_announced():
+    writer, reader = make(1000)
+    assert writer.put(0, b"one", 1)
+    assert list(reader.take()) == []
+    assert writer.put(0, b"two", 2)
+    assert [entry.content for entry in reader.take()] == [b"one"]
+    assert [entry.content for entry in reader.take_rest()] == [b"two"]
+
+
+def test_a_full_ring_refuses_and_goes_on_once_there_is_room():
+    writer, reader = make(100)
+    taken = 0
+    while writer.put(0, b"0123456789", 0):
+        taken += 1
+    assert taken == 4  # 23 bytes each
+    assert not writer.put(0, b"0123456789", 0)
+    assert len(list(reader.take_rest())) == 4
+    assert writer.put(0, b"0123456789", 0)
+    assert not writer.put(0, bytes(101), 0)  # never fits
