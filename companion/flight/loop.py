@@ -22,14 +22,14 @@ from companion.control.types import State
 from companion.errors import LinkError
 from companion.flight.clock import VehicleClock
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
-from companion.flight.course import at_rest
+from companion.flight.course import Course, at_rest
 from companion.flight.guards import Guards, coast_setpoint
 from companion.flight.last_resort import ask_for_hold
 from companion.flight.phases import Autopilot, Cause, FlightEnded, Outcome, Phase
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
-from companion.flight.tracker import Kernels, Tracker
+from companion.flight.tracker import Kernels, Tracker, TrackerStep
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
@@ -77,6 +77,20 @@ class Progress(NamedTuple):
     duration_s: float
     error_m: float
     steps: int
+
+
+class _Step(NamedTuple):
+    """A control step whose setpoint is out, before it is recorded and judged."""
+
+    state: VehicleState
+    out: TrackerStep
+    course: Course
+    course_s: float
+    """Time on the course [s]."""
+    phase: Phase
+    track_s: float
+    skipped: int
+    arrival_ns: int
 
 
 class FlightLoop:
@@ -135,6 +149,8 @@ class FlightLoop:
         self._sent_us: int | None = None
         """Stamp of the last state that a setpoint went out for."""
         self._coasted = False
+        self._unaccounted: _Step | None = None
+        self._sent_ns = 0
         self._guards = Guards(flight.vehicle.limits)
         self._heartbeat_s = -math.inf
         self._progress_ns = 0
@@ -183,6 +199,8 @@ class FlightLoop:
 
     def _leave(self, detail: str) -> str:
         """However it ended: a vehicle that may still be following setpoints gets the coast setpoint and Hold."""
+        with contextlib.suppress(Exception):  # the last step's row
+            self._account()
         if not self._met or not self._sequence.owes_hold:
             return detail
         with contextlib.suppress(Exception):  # what failed may fail again; Hold is asked for all the same
@@ -243,6 +261,7 @@ class FlightLoop:
             self._answer_state()
             self._tick()
         self._answer_requests()
+        self._account()
         self._look_at_the_wall_clock()
 
     def _wait_s(self) -> float:
@@ -306,9 +325,15 @@ class FlightLoop:
         self._requests.append((message, frame))
         if self._peer.paced:
             self._timesync_at_ns = message.ts1
-            self._answer_state()
-            self._tick()
-            self._answer_requests()
+            self._wire.gather()
+            try:
+                self._answer_state()
+                self._tick()
+                self._answer_requests()
+            finally:
+                self._wire.release()
+            self._sent_ns = time.monotonic_ns()
+            self._account()
 
     def _answer_requests(self) -> None:
         wire = self._wire
@@ -399,20 +424,29 @@ class FlightLoop:
         if not self._send(out.setpoint, state):
             self._lost += 1
             return
-        sent_ns = time.monotonic_ns()
-        reference = course.at(stamp_s - begin_s)
+        self._sent_ns = time.monotonic_ns()
+        track_s = sequence.track_time_s(stamp_s)
+        self._unaccounted = _Step(state, out, course, stamp_s - begin_s, sequence.phase, track_s, skipped, arrival_ns)
+
+    def _account(self) -> None:
+        """Records and judges the last step: after its setpoint is out, and while a vehicle in lockstep moves on."""
+        step, self._unaccounted = self._unaccounted, None
+        if step is None:
+            return
+        state, sent_ns = step.state, self._sent_ns
+        reference = step.course.at(step.course_s)
         error = (state.p[0] - reference.p[0], state.p[1] - reference.p[1], state.p[2] - reference.p[2])
-        phase, track_s = sequence.phase, sequence.track_time_s(stamp_s)
-        shown_s = track_s if phase is Phase.TRACK else math.nan
-        timing = self._timing(state, skipped, arrival_ns, sent_ns)
-        row = control_row(shown_s, phase, state, reference, error, out, timing)
+        shown_s = step.track_s if step.phase is Phase.TRACK else math.nan
+        timing = self._timing(state, step.skipped, step.arrival_ns, sent_ns)
+        row = control_row(shown_s, step.phase, state, reference, error, step.out, timing)
         self._record.append(row)
         finding = self._guards.check(state.q, error, self._last_state_s)
         if finding is not None:
-            sequence.end(*finding, self._last_state_s)
+            self._sequence.end(*finding, self._last_state_s)
         if sent_ns - self._progress_ns > PROGRESS_NS:
             self._progress_ns = sent_ns
-            self._progress(Progress(phase.value, track_s, course.track_s, math.hypot(*error), len(self._record)))
+            course_s = step.course.track_s
+            self._progress(Progress(step.phase.value, step.track_s, course_s, math.hypot(*error), len(self._record)))
 
     def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:
         took_ns = sent_ns - arrival_ns
