@@ -328,12 +328,13 @@ class FlightLoop:
             self._wire.gather()
             try:
                 self._answer_state()
-                self._tick()
                 self._answer_requests()
             finally:
                 self._wire.release()
+            # The vehicle moves on now: what can wait is done meanwhile, and what it sends counts at the next state.
             self._sent_ns = time.monotonic_ns()
             self._account()
+            self._tick()
 
     def _answer_requests(self) -> None:
         wire = self._wire
