@@ -76,12 +76,17 @@ class Link(Section):
 
 
 class Noise(Section):
-    """[noise]: of the simulated vehicle's state, one sigma per axis."""
+    """[noise]: of the simulated vehicle's state, one sigma per axis; and the random walk of its bias."""
 
     position_m: NotNegative
     velocity_m_s: NotNegative
     attitude_rad: NotNegative
     rate_rad_s: NotNegative
+    position_walk_m_per_sqrt_s: NotNegative = 0.0
+    velocity_walk_m_s_per_sqrt_s: NotNegative = 0.0
+    yaw_walk_rad_per_sqrt_s: NotNegative = 0.0
+    rate_walk_rad_s_per_sqrt_s: NotNegative = 0.0
+    walk_time_constant_s: NotNegative = 0.0
 
 
 class Controller(Section):
@@ -212,9 +217,17 @@ class SimulatedWorld(Section):
 
 
 class Output(Section):
-    """[output]: which setpoints go to the autopilot."""
+    """[output]: who follows the reference, and which setpoints go to the autopilot."""
 
+    controller: Literal["law", "px4"] = "law"
+    """"px4": the reference itself is sent and PX4's own position controller follows it; then `kind` means nothing."""
     kind: Literal["rates", "attitude", "actuators"] = "rates"
+    """What the law sends."""
+
+    @property
+    def sends(self) -> Literal["rates", "attitude", "actuators", "position"]:
+        """The setpoints that go to the autopilot."""
+        return "position" if self.controller == "px4" else self.kind
 
 
 class Acceptance(Section):
@@ -244,6 +257,8 @@ class Flight(Section):
     acceptance: Acceptance = Acceptance()
     statistics_from_s: NotNegative | None = None
     takeoff_altitude_m: Positive = 5.0
+    height_min_m: Finite = 0.5
+    """Lowest height above home that a trajectory may ask for; below zero where the ground falls off."""
     after: Literal["hold", "land"] = "hold"
 
 
@@ -253,7 +268,20 @@ def bundled_root() -> Path:
     return installed if installed.is_dir() else Path(__file__).parent.parent / "config"
 
 
-_SINGULAR = {"vehicles": "vehicle", "trajectories": "trajectory", "flights": "flight"}
+def _with_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The contents of a trajectory or flight file, with the paths of trajectory files in them made absolute."""
+    out = dict(data)
+    if isinstance(out.get("file"), str):
+        out["file"] = str(folder.absolute() / out["file"])
+    named = out.get("trajectory")
+    if isinstance(named, dict):
+        out["trajectory"] = _with_paths(named, folder)
+    elif isinstance(named, str) and "\0" not in named and not Path(named).is_file() and (folder / named).is_file():
+        out["trajectory"] = str(folder.absolute() / named)
+    return out
+
+
+_SINGULAR = {"vehicles": "vehicle", "trajectories": "trajectory", "flights": "flight", "faults": "fault"}
 
 
 def find(name: str, kind: str) -> Path:
@@ -261,7 +289,7 @@ def find(name: str, kind: str) -> Path:
 
     Args:
         name: a path, or a bundled file's name without ending.
-        kind: "vehicles", "trajectories" or "flights".
+        kind: "vehicles", "trajectories", "flights" or "faults".
 
     Raises:
         InputError: there is neither.
@@ -281,14 +309,19 @@ def find(name: str, kind: str) -> Path:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The contents of a TOML file, or an InputError that names the line."""
+    """The contents of a TOML file, or an InputError that names the line.
+
+    A trajectory's file that it names counts from its own folder, wherever the contents go from here.
+    """
     try:
         with path.open("rb") as file:
-            return tomllib.load(file)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+            return _with_paths(tomllib.load(file), path.parent)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file (UTF-8 expected): byte {error.start}") from None
+    except ValueError as error:  # the decoder's own, and numbers with thousands of digits
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: nested too deeply") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from .beliefs import Beliefs
 from .engines import Setup, make_engine
 from .estimator import Estimate, age_steps
 from .inner_loops import Setpoint, make_gains
@@ -62,7 +63,7 @@ class Airframe:
         Args:
             vehicle: what it is.
             world: what is around it; its seed is that of the gusts.
-            seed: of the estimator's noise.
+            seed: of the estimator's noise and bias walk.
             engine: "python", "numba" or "auto" (see `accelerate.choose`).
             start: position NED [m] and yaw [rad] at which to hover, level, the rotors carrying the vertical load;
                 None = on the ground, rotors off.
@@ -98,8 +99,20 @@ class Airframe:
             ),
         )
         self._thrust_factor = 1.0
+        self._rotor_shares: Vec4 = (1.0, 1.0, 1.0, 1.0)
+        self._gust_m_s: Vec3 | None = None
         self._engine.force_n = world.force_n
         self._engine.air_m_s = self._wind.air_m_s
+        self.beliefs = Beliefs(
+            self._engine,
+            lambda: self._engine.rigid,
+            lambda: self.t_us,
+            vehicle=vehicle,
+            seed=seed,
+            dt_us=self.dt_us,
+            age_steps=self.age_steps,
+        )
+        """What goes wrong with the estimate."""
 
     def _start(self, start: tuple[Vec3, float] | None) -> RigidState:
         if start is None:
@@ -127,30 +140,40 @@ class Airframe:
         return self._engine.impact_speed_m_s
 
     def advance(self, setpoint: Setpoint, fresh: bool, n_steps: int) -> None:
-        """Run n_steps physics steps with one setpoint; `fresh`: it is a new one (acts on the first step)."""
-        engine, wind = self._engine, self._wind
+        """Run n_steps physics steps with one setpoint; `fresh`: it is a new one (acts on the first step).
+
+        An attitude is meant in the frame that the vehicle believes in: its heading is off by what the estimate's is.
+        """
+        engine, wind, beliefs = self._engine, self._wind, self.beliefs
+        if beliefs.active:
+            setpoint = beliefs.in_truth(setpoint)
         while n_steps > 0:
             gusty = wind.gusty
             steps = min(n_steps, self._steps_per_gust - self._gust_phase) if gusty else n_steps
+            if beliefs.recording:
+                steps = 1
             engine.run(setpoint, fresh, steps)
             fresh = False
             n_steps -= steps
             self.t_us += steps * self.dt_us
+            if beliefs.recording:
+                beliefs.record()
             self._gust_phase = (self._gust_phase + steps) % self._steps_per_gust
             if gusty and self._gust_phase == 0:
                 wind.advance()
-                engine.air_m_s = wind.air_m_s
+                engine.air_m_s = wind.air_m_s if self._gust_m_s is None else self._air()
 
     def believed(self, steps_ahead: int = 0) -> Estimate:
         """Return what the vehicle believes: late and noisy, stamped with the sample's time.
 
         With steps_ahead, at most `age_steps`: what it will believe in so many steps, which is the past already.
         """
-        return self._engine.believed(steps_ahead)
+        return self.beliefs.estimate(steps_ahead) if self.beliefs.active else self._engine.believed(steps_ahead)
 
     def inner_state(self) -> RigidState:
-        """Return the state without delay and noise that the autopilot's own loops use."""
-        return self._engine.rigid
+        """Return the state without delay and noise that the autopilot's own modes use: the truth, but for `beliefs`."""
+        rigid = self._engine.rigid
+        return self.beliefs.inner(rigid) if self.beliefs.active else rigid
 
     def rates_followed(self) -> Vec3:
         """Return the body rates that the rate loop follows [rad/s]."""
@@ -164,13 +187,22 @@ class Airframe:
         """Change every rotor's thrust, as a share of the vehicle file's, from now on."""
         if factor != self._thrust_factor:
             self._thrust_factor = factor
-            full_n = self.vehicle.rotor_thrust_max_n
-            self._engine.set_body(self._body._replace(rotor_thrust_max_n=factor * full_n))
+            self._set_rotors()
+
+    def set_rotor_shares(self, shares: Vec4) -> None:
+        """Change what each rotor still gives of its thrust at a command, from now on; 0 = it stands still."""
+        if shares != self._rotor_shares:
+            self._rotor_shares = shares
+            self._set_rotors()
+
+    def _set_rotors(self) -> None:
+        full_n = self._thrust_factor * self.vehicle.rotor_thrust_max_n
+        self._engine.set_body(self._body._replace(rotor_thrust_max_n=full_n, rotor_share=self._rotor_shares))
 
     def truth(self) -> Truth:
         """Return the truth now; on the ground the disturbance leaves out what the ground does."""
         r = self._engine.rigid
-        air, force, body = self._wind.air_m_s, self._engine.force_n, self._body
+        air, force, body = self._engine.air_m_s, self._engine.force_n, self._body
         disturbance = (
             body.drag_1_s * air[0] + force[0] / body.mass_kg,
             body.drag_1_s * air[1] + force[1] / body.mass_kg,
@@ -181,7 +213,16 @@ class Airframe:
     def set_wind(self, wind_m_s: Vec3, turbulence: float) -> None:
         """Change the mean wind (NED) in a step, and its turbulence, from now on."""
         self._wind.set_wind(wind_m_s, turbulence)
-        self._engine.air_m_s = self._wind.air_m_s
+        self._engine.air_m_s = self._air()
+
+    def set_gust(self, gust_m_s: Vec3 | None) -> None:
+        """Add a velocity (NED) to that of the air from now on, in the place of the one added before; None: nothing."""
+        self._gust_m_s = gust_m_s
+        self._engine.air_m_s = self._air()
+
+    def _air(self) -> Vec3:
+        air, gust = self._wind.air_m_s, self._gust_m_s
+        return air if gust is None else (air[0] + gust[0], air[1] + gust[1], air[2] + gust[2])
 
     def set_force(self, force_n: Vec3) -> None:
         """Change the constant force (NED) from now on."""

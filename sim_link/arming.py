@@ -19,6 +19,8 @@ def arming_obstacle(autopilot: Autopilot) -> str | None:
         return "COM_ARMABLE is 0"
     if not autopilot.intended.can_arm:
         return f"mode {autopilot.intended.label} prevents it, switch to another one first"
+    if not autopilot.estimate_ok:
+        return "no valid attitude and position estimate"
     if autopilot.intended is Mode.OFFBOARD and not autopilot.offboard_ok:
         return "no offboard signal"
     if autopilot.intended is Mode.MISSION and not autopilot.guidance.mission.can_run:

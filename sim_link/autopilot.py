@@ -11,7 +11,7 @@ from enum import IntEnum
 
 from .arming import arming_obstacle
 from .codec import ActuatorControls, AttitudeTarget
-from .failsafe import Action, Cause, Decision, Health, decide
+from .failsafe import Action, Cause, Decision, Health, decide, without_estimate
 from .geofence import Geofence
 from .guidance import Guidance
 from .inner_loops import ATTITUDE, STOPPED_SETPOINT, Setpoint
@@ -24,12 +24,14 @@ from .orders import Orders
 from .parameters import Parameters
 from .physics import RigidState
 from .position_loop import PositionSetpoint
-from .rotation import Vec3, yaw_of
+from .rotation import Vec3, from_yaw, multiply, yaw_of
 from .watch import DisarmTimer, TiltWatch
 
 HEALTH_PERIOD_US = 100_000
 WATCH_PERIOD_US = 20_000
 FENCE_PERIOD_US = 200_000
+ESTIMATE_TIMEOUT_S = 1.0
+"""An estimate older than this is none."""
 EARLY_FLIGHT_S = 3.0
 """After the spool-up: so long a tilt failure disarms."""
 TILT_BREAKER = 121212
@@ -64,11 +66,13 @@ class Autopilot:
         now_us: int,
         home: Vec3,
         setpoint_delay_us: int = 0,
+        plans: Plans | None = None,
     ) -> None:
         self.parameters = parameters
         self.px4 = px4
         self.system = system
-        self.plans = Plans()
+        self.plans = Plans() if plans is None else plans
+        """Missions, geofence, rally points: they are kept through a reboot."""
         self.sticks = ManualInput(parameters)
         self.fence = Geofence(parameters, self.plans)
         self.battery_charge = 1
@@ -97,6 +101,8 @@ class Autopilot:
         self._took_off = in_air
         self._offboard_ok = False
         self._ground_us: int | None = None
+        self._blind_us: int | None = None
+        """Since when there is no estimate."""
         self._sticks_at_arming = False
         self._lost_us: dict[Cause, int] = {}
         self._disarm_timer = DisarmTimer(parameters)
@@ -234,14 +240,39 @@ class Autopilot:
         """Give the pilot, who moves the sticks, the vehicle: Position, or what can run of the others."""
         if not self.armed or self.mode.needs_sticks or self.land.landed or self.terminated:
             return
-        if self.set_mode(Mode.POSITION) is Result.ACCEPTED:
+        if self.set_mode(Mode.POSITION if self.estimate_ok else Mode.STABILIZED) is Result.ACCEPTED:
             self._say(INFO, "Pilot took over using sticks")
 
     def ground_heartbeat(self) -> None:
         """Take note of a ground station's heartbeat."""
         self._ground_us = self._now_us
 
+    def see_estimate(self, available: bool) -> None:
+        """Take note whether there is an estimate of attitude and position."""
+        if available:
+            self._blind_us = None
+        elif self._blind_us is None:
+            self._blind_us = self._now_us
+
+    def estimate_reset(self, dp_m: Vec3, dv_m_s: Vec3, dyaw_rad: float) -> None:
+        """Take note that the estimate has jumped: NED [m], [m/s], and heading [rad]."""
+        self.guidance.shift(dp_m, dv_m_s, dyaw_rad)
+        self.offboard.shift(dp_m, dv_m_s, dyaw_rad)
+        self._orders.shift(dv_m_s, dyaw_rad)
+        if self.held.mode == ATTITUDE and dyaw_rad != 0.0:
+            self.held = self.held._replace(q=multiply(from_yaw(dyaw_rad), self.held.q))
+
     # What there is to report
+
+    @property
+    def has_estimate(self) -> bool:
+        """Whether there is an estimate of attitude and position at this moment."""
+        return self._blind_us is None
+
+    @property
+    def estimate_ok(self) -> bool:
+        """Whether the last estimate is not too old."""
+        return self._blind_us is None or (self._now_us - self._blind_us) * 1e-6 <= ESTIMATE_TIMEOUT_S
 
     @property
     def sticks_ok(self) -> bool:
@@ -382,6 +413,9 @@ class Autopilot:
         """Give the setpoint of the mode in charge."""
         if not self.armed or self.terminated:
             return self._orders.nothing()
+        blind = self._blind_us is not None and self._orders.needs_estimate(self.mode)
+        if blind and self.held is not STOPPED_SETPOINT:
+            return Order(self.held, False)  # the position controller runs with estimates only
         spooled_up = (self._now_us - self._armed_us) * 1e-6 >= self.parameters.number("COM_SPOOLUP_TIME")
         return self._orders.give(self.mode, self._now_us, rigid, dt_s, self.held, spooled_up)
 
@@ -392,7 +426,8 @@ class Autopilot:
 
         PX4 does so at 10 Hz, and at once when a lost signal returns.
         """
-        self._offboard_ok = self.offboard.signal_ok(self._now_us)
+        blind = self.offboard.wants_trajectory and not self.estimate_ok
+        self._offboard_ok = self.offboard.signal_ok(self._now_us) and not blind
         self._evaluate()
 
     def _evaluate(self) -> None:
@@ -408,6 +443,8 @@ class Autopilot:
                 self.battery_charge,
             )
             decision = self._delayed(decide(self.intended, health, self.parameters))
+            if not self.estimate_ok:
+                decision = without_estimate(self.intended, decision, health.sticks_ok)
         changed = decision != self.failsafe
         self.failsafe = decision
         if self.in_failsafe and decision is not None and changed:
@@ -447,8 +484,8 @@ class Autopilot:
         if mode is Mode.OFFBOARD:
             return self._offboard_ok
         if mode is Mode.MISSION:
-            return self.guidance.mission.can_run
-        return self.sticks_ok or not mode.needs_sticks
+            return self.guidance.mission.can_run and self.estimate_ok
+        return (self.sticks_ok or not mode.needs_sticks) and (self.estimate_ok or not mode.needs_estimate)
 
     def _disarm(self, sentence: str) -> None:
         """Stop the rotors."""

@@ -5,17 +5,30 @@ from __future__ import annotations
 import gc
 import json
 import os
-import signal
 import sys
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
-from math import isfinite, radians
+from math import radians
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
 
+from . import fault_cli, hil_cli
+from .cli_values import (
+    ENGINES,
+    InputError,
+    Stop,
+    choice,
+    number,
+    numbers,
+    port_or,
+    refuse,
+    tell,
+    vector,
+)
+from .fault_file import load as load_faults
+from .fault_keys import FaultError
 from .parameters import ParameterError, Parameters
 from .peer import Peer, PeerOptions
 from .rotation import Vec3
@@ -24,16 +37,12 @@ from .vehicle import PX4_VERSIONS, Vehicle, VehicleError, VehicleOptions
 from .vehicle_file import VehicleFile, VehicleFileError, load
 from .wind import World
 
-EXIT_DONE, EXIT_BAD_INPUT = 0, 2
-_ENGINES = ("auto", "python", "numba")
+FAULTS_SUFFIX = ".faults.csv"
+"""In the place of the truth file's own."""
 _SITL_SECOND_RANGE = 10
 """From this instance on PX4's ports would run into one another; ours go on 10000 higher."""
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
-
-
-class InputError(ValueError):
-    """Something on the command line that cannot be used; the message is one line."""
 
 
 def _show_version(wanted: bool) -> None:
@@ -82,6 +91,9 @@ def run(
     param: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set an autopilot parameter (repeatable).")
     ] = None,
+    faults: Annotated[
+        str | None, typer.Option(metavar="FILE", help="What goes wrong: a fault file, or the name of a bundled one.")
+    ] = None,
     port: Annotated[int | None, typer.Option(help="Companion link, own port; 0: any free; default 14580 + i.")] = None,
     remote_port: Annotated[
         int | None, typer.Option(help="Companion link, port spoken to first; 0: none; default 14540 + i.")
@@ -100,15 +112,17 @@ def run(
 
     Companion link: from port 14580 + i to 127.0.0.1:14540 + i (from i = 10 on 24580 + i and 24540 + i). Ground link:
     18570 + i to 14550. The truth goes to 19410 + i. Exit code 2: bad input, or a port in use.
+
+    With --truth FILE.csv, what went wrong and when is written to FILE.faults.csv. docs/faults.md lists what can.
     """
-    stop = _Stop(with_parent)
+    stop = Stop(with_parent)
     try:
         file = _vehicle_file(vehicle, state_rate, state_age)
         world = World(
-            force_n=_vector(force, "--force"),
-            gravity_factor=_number(gravity_factor, "--gravity-factor", above=0.0),
-            wind_m_s=_vector(wind, "--wind"),
-            turbulence=_number(turbulence, "--turbulence"),
+            force_n=vector(force, "--force"),
+            gravity_factor=number(gravity_factor, "--gravity-factor", above=0.0),
+            wind_m_s=vector(wind, "--wind"),
+            turbulence=number(turbulence, "--turbulence"),
             seed=seed,
         )
         options = VehicleOptions(
@@ -117,9 +131,10 @@ def run(
             instance=instance,
             start=_pose(start),
             seed=seed,
-            px4=_choice(px4, PX4_VERSIONS, "--px4"),
-            engine=_choice(engine, _ENGINES, "--engine"),
+            px4=choice(px4, PX4_VERSIONS, "--px4"),
+            engine=choice(engine, ENGINES, "--engine"),
             parameters=_parameters(param or [], px4),
+            faults=() if faults is None else load_faults(faults, px4),
         )
         peer_options = _peer_options(
             instance,
@@ -131,15 +146,16 @@ def run(
             speed=speed,
         )
         if duration is not None:
-            _number(duration, "--duration", above=0.0)
+            number(duration, "--duration", above=0.0)
         _warm_up(options)
-        peer = Peer(Vehicle(options), peer_options, stopped=stop, notice=_tell)
+        peer = Peer(Vehicle(options), peer_options, stopped=stop, notice=tell)
         if truth is not None:
             peer.log_truth(TruthLog(truth))
-    except (InputError, VehicleFileError, VehicleError, ParameterError, ImportError) as error:
-        _refuse(str(error))
+            peer.vehicle.faults.log_to(truth.with_suffix(FAULTS_SUFFIX))
+    except (InputError, VehicleFileError, VehicleError, ParameterError, FaultError, ImportError) as error:
+        refuse(str(error))
     except OSError as error:  # a port, or the truth file
-        _refuse(str(error) if error.strerror is None else f"{error.filename}: {error.strerror}")
+        refuse(str(error) if error.strerror is None else f"{error.filename}: {error.strerror}")
     _announce(peer, json_ready)
     gc.collect()
     gc.freeze()
@@ -165,40 +181,14 @@ def _peer_options(
     own_ground, remote_ground = ground or (None, 0)
     ground_default = 0 if port == 0 else 18570 + instance
     return PeerOptions(
-        port=_port_or(port, 14580 + shift, "--port"),
-        remote_port=_port_or(remote_port, 14540 + shift, "--remote-port"),
-        ground_port=_port_or(own_ground, ground_default, "--ground-port") if ground is not None else None,
-        ground_remote_port=_port_or(remote_ground, 0, "--ground-remote-port"),
-        truth_port=_port_or(truth_port, 19410 + instance, "--truth-port") if truth_stream else None,
+        port=port_or(port, 14580 + shift, "--port"),
+        remote_port=port_or(remote_port, 14540 + shift, "--remote-port"),
+        ground_port=port_or(own_ground, ground_default, "--ground-port") if ground is not None else None,
+        ground_remote_port=port_or(remote_ground, 0, "--ground-remote-port"),
+        truth_port=port_or(truth_port, 19410 + instance, "--truth-port") if truth_stream else None,
         lockstep=lockstep,
-        speed=_number(speed, "--speed", above=0.0),
+        speed=number(speed, "--speed", above=0.0),
     )
-
-
-class _Stop:
-    """Knows whether to stop: a signal came, or the parent process is gone."""
-
-    def __init__(self, with_parent: bool) -> None:
-        self._wanted = False
-        self._parent = os.getppid() if with_parent else None
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._wanted = True
-
-    def __call__(self) -> bool:
-        return self._wanted or (self._parent is not None and os.getppid() != self._parent)
-
-
-def _refuse(sentence: str) -> None:
-    """Say what is wrong in one line, and end."""
-    typer.echo(f"sim-link: {sentence}", err=True)
-    raise typer.Exit(EXIT_BAD_INPUT)
-
-
-def _tell(sentence: str) -> None:
-    typer.echo(f"sim-link: {sentence}", err=True)
 
 
 def _announce(peer: Peer, as_json: bool) -> None:
@@ -238,63 +228,24 @@ def _vehicle_file(name: str, state_rate_hz: float | None, state_age_s: float | N
     """Load the vehicle file, with what the command line replaces."""
     file = load(name)
     if state_rate_hz is not None:
-        file = replace(file, state_rate_hz=_number(state_rate_hz, "--state-rate", above=0.0))
+        file = replace(file, state_rate_hz=number(state_rate_hz, "--state-rate", above=0.0))
     if state_age_s is not None:
-        file = replace(file, state_age_s=_number(state_age_s, "--state-age"))
+        file = replace(file, state_age_s=number(state_age_s, "--state-age"))
         if state_age_s > 1.0:
             raise InputError(f"--state-age {state_age_s:g}: allowed are 0 to 1 s")
     return file
-
-
-def _number(value: float, option: str, above: float | None = None) -> float:
-    """Check a number: finite, not negative, or above a bound."""
-    if not isfinite(value) or value < 0.0 or (above is not None and value <= above):
-        allowed = "0 or more" if above is None else f"more than {above:g}"
-        raise InputError(f"{option} {value:g}: allowed is {allowed}")
-    return value
-
-
-def _numbers(text: str, option: str, counts: tuple[int, ...], form: str) -> list[float]:
-    """Read comma-separated numbers."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in counts or not all(map(isfinite, values)):
-        raise InputError(f"{option} {text!r}: expected {form}")
-    return values
-
-
-def _vector(text: str, option: str) -> Vec3:
-    n, e, d = _numbers(text, option, (3,), "three numbers north,east,down")
-    return n, e, d
 
 
 def _pose(text: str | None) -> tuple[Vec3, float] | None:
     """Read a start in the air: position, and yaw in degrees."""
     if text is None:
         return None
-    values = _numbers(text, "--start", (3, 4), "north,east,down in metres and, if wanted, a yaw in degrees")
+    values = numbers(text, "--start", (3, 4), "north,east,down in metres and, if wanted, a yaw in degrees")
     if values[2] >= 0.0:
         raise InputError(
             f"--start {text!r}: down must be negative, the ground is at 0; leave --start out for the ground"
         )
     return (values[0], values[1], values[2]), radians(values[3] if len(values) > 3 else 0.0)
-
-
-def _choice(value: str, allowed: tuple[str, ...], option: str) -> str:
-    if value not in allowed:
-        raise InputError(f"{option} {value!r}: allowed are {', '.join(allowed)}")
-    return value
-
-
-def _port_or(number: int | None, default: int, option: str) -> int:
-    """Check a port; None is the default."""
-    if number is None:
-        return default
-    if not 0 <= number <= 65535:
-        raise InputError(f"{option} {number}: allowed are 0 to 65535")
-    return number
 
 
 def _parameters(items: list[str], px4: str) -> dict[str, int | float]:
@@ -311,6 +262,10 @@ def _parameters(items: list[str], px4: str) -> dict[str, int | float]:
             raise InputError(f"--param {item!r}: {error}") from None
         values[name] = trial[name]
     return values
+
+
+app.command("fault", epilog=fault_cli.EXAMPLE)(fault_cli.run)
+app.command("hil", epilog=hil_cli.EXAMPLE)(hil_cli.run)
 
 
 def main() -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 from .autopilot import INFO, Autopilot, Result
 from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, mavlink
@@ -58,15 +58,35 @@ class Command(NamedTuple):
         return not (math.isnan(value) or value == 0.0)
 
 
+class Failures(Protocol):
+    """What goes wrong on purpose, as far as commands have to do with it."""
+
+    @property
+    def refused(self) -> Mapping[int, Result]:
+        """Commands that are refused now, and how."""
+
+    def inject_failure(self, unit: int, kind: int, instance: int) -> Result:
+        """Obey MAV_CMD_INJECT_FAILURE: FAILURE_UNIT, FAILURE_TYPE, which of them (0: all)."""
+
+
 class Commands:
     """The commands that this vehicle obeys."""
 
-    def __init__(self, autopilot: Autopilot, parameters: Parameters, telemetry: Telemetry, *, system: int) -> None:
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        parameters: Parameters,
+        telemetry: Telemetry,
+        *,
+        system: int,
+        failures: Failures | None = None,
+    ) -> None:
         self._autopilot = autopilot
         self._parameters = parameters
         self._telemetry = telemetry
         self._autotune_us: int | None = None
         self._system = system
+        self._failures = failures
         self._handlers: dict[int, Callable[[Command], Result]] = {
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
             mavlink.MAV_CMD_DO_SET_MODE: self._set_mode,
@@ -82,6 +102,7 @@ class Commands:
             mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_mission_current,
             mavlink.MAV_CMD_RUN_PREARM_CHECKS: lambda _: self._autopilot.check_arming(),
             mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._storage,
+            mavlink.MAV_CMD_INJECT_FAILURE: self._inject_failure,
             # Peripherals that this vehicle has none of: PX4 accepts it whatever is connected.
             mavlink.MAV_CMD_DO_SET_ACTUATOR: lambda _: Result.ACCEPTED,
         }
@@ -108,6 +129,8 @@ class Commands:
 
     def _obey(self, command: Command, link: Link, now_us: int) -> Result:
         """Find the command's handler; refuse params that it does not know."""
+        if self._failures is not None and command.number in self._failures.refused:
+            return self._failures.refused[command.number]
         if self._autopilot.px4 != "1.13":
             forbidden = _ALL - _ALLOWED.get(command.number, _ALL)
             if any(command.is_set(number) for number in forbidden):
@@ -236,6 +259,13 @@ class Commands:
         if self._autotune_us is None:
             return 0
         return min(100, int((now_us - self._autotune_us) * 1e-4 / _AUTOTUNE_S))
+
+    def _inject_failure(self, command: Command) -> Result:
+        """INJECT_FAILURE: param1 unit, param2 type, param3 instance, 0 or NaN: all."""
+        unit, kind = command.whole(1), command.whole(2)
+        if self._failures is None or unit is None or kind is None:
+            return Result.UNSUPPORTED
+        return self._failures.inject_failure(unit, kind, command.whole(3) or 0)
 
     def _flight_termination(self, command: Command) -> Result:
         if command.params[0] > 0.5:

@@ -70,6 +70,9 @@ class Engine(Protocol):
     def run(self, setpoint: Setpoint, fresh: bool, n_steps: int) -> None:
         """Run steps with one setpoint; `fresh`: it is a new one."""
 
+    def set_noise_factor(self, factor: float) -> None:
+        """Scale the vehicle file's noise, of the estimates that are asked for from now on."""
+
     def believed(self, steps_ahead: int) -> Estimate:
         """Return the estimate that is the newest in so many steps, at most its age; asking twice is free."""
 
@@ -104,6 +107,7 @@ class PlainEngine:
         self._dt_s = setup.dt_us * 1.0e-6
         self._t_us = setup.t_us
         self._loops = initial_loops(setup.rigid.w)
+        self._vehicle = setup.vehicle
         self._estimator = Estimator(
             setup.vehicle, seed=setup.seed, t_us=setup.t_us, rigid=setup.rigid, dt_us=setup.dt_us
         )
@@ -133,6 +137,10 @@ class PlainEngine:
             self._t_us += dt_us
             push(self._t_us, rigid)
         self.rigid, self._loops, self.on_ground = rigid, loops, sinking >= 0.0
+
+    def set_noise_factor(self, factor: float) -> None:
+        """Scale the noise (see Engine)."""
+        self._estimator.set_noise(noise_of(self._vehicle, factor))
 
     def believed(self, steps_ahead: int) -> Estimate:
         """Return an estimate (see Engine)."""
@@ -178,6 +186,7 @@ class CompiledEngine:
         """Number of the oldest sample of the ring; `_row` is its place."""
         self._row = 0
         self._blocks = NoiseBlocks(setup.seed)
+        self._vehicle = setup.vehicle
         self._set: Setpoint | None = None
         self._rigid: RigidState | None = setup.rigid
         self._last: Estimate | None = None
@@ -261,6 +270,11 @@ class CompiledEngine:
         self._rigid = None
         self._sample += n_steps
         self._row = (self._row + n_steps) % self._ring_rows
+
+    def set_noise_factor(self, factor: float) -> None:
+        """Scale the noise (see Engine)."""
+        self._put(flat.SIGMAS, noise_of(self._vehicle, factor))
+        self._last = None
 
     def believed(self, steps_ahead: int) -> Estimate:
         """Return an estimate (see Engine)."""

@@ -1,4 +1,4 @@
-"""What the vehicle believes: the truth, some time ago, with noise.
+"""What the vehicle believes: the truth, some time ago, with noise. What goes wrong with it is in `beliefs`.
 
 Two stages, each of which can be given more to do: which true sample the estimator is at (`Estimator._sample`: a fixed
 delay), and what it makes of it (`with_noise`: white noise). The noise of a sample is a function of seed and sample
@@ -69,10 +69,13 @@ def with_noise(p: Vec3, v: Vec3, q: Quat, w: Vec3, noise: Noise, numbers: Twelve
     )
 
 
-def noise_of(vehicle: VehicleFile) -> Noise:
-    """Return the sigmas of a vehicle file."""
+def noise_of(vehicle: VehicleFile, factor: float = 1.0) -> Noise:
+    """Return the sigmas of a vehicle file, scaled by a factor."""
     return Noise(
-        vehicle.noise_position_m, vehicle.noise_velocity_m_s, vehicle.noise_attitude_rad, vehicle.noise_rate_rad_s
+        factor * vehicle.noise_position_m,
+        factor * vehicle.noise_velocity_m_s,
+        factor * vehicle.noise_attitude_rad,
+        factor * vehicle.noise_rate_rad_s,
     )
 
 
@@ -127,6 +130,11 @@ class Estimator:
     def push(self, t_us: int, rigid: RigidState) -> None:
         """Take the true state at the end of one physics step."""
         self._samples.append((t_us, rigid))
+
+    def set_noise(self, noise: Noise) -> None:
+        """Change the noise of the estimates that are asked for from now on."""
+        self._noise = noise
+        self._last = None
 
     def believed(self, steps_ahead: int = 0) -> Estimate:
         """Return the newest estimate, or the one so many steps from now, at most its age; asking twice is free."""

@@ -27,6 +27,7 @@ class Action(Enum):
     HOLD = (Mode.HOLD, "Hold")
     RETURN = (Mode.RETURN, "Return")
     LAND = (Mode.LAND, "Land")
+    DESCEND = (Mode.DESCEND, "Descend")
     TERMINATE = (Mode.TERMINATION, "Termination")
     DISARM = (None, "Disarm")
 
@@ -50,6 +51,7 @@ class Cause(Enum):
     GROUND_LOST = "Ground station connection lost"
     FENCE = "Geofence violation"
     BATTERY = "Battery low"
+    ESTIMATE_LOST = "Position estimate lost"
 
 
 class Decision(NamedTuple):
@@ -98,6 +100,7 @@ _SEVERITY = (
     Action.HOLD,
     Action.RETURN,
     Action.LAND,
+    Action.DESCEND,
     Action.DISARM,
     Action.TERMINATE,
 )
@@ -146,6 +149,21 @@ def decide(intended: Mode, health: Health, parameters: Parameters) -> Decision |
         if action is not Action.NONE and graver:
             decision = Decision(action, cause)
     return decision
+
+
+def without_estimate(intended: Mode, decision: Decision | None, sticks_ok: bool) -> Decision | None:
+    """Replace what cannot be flown without an estimate of position and height by the next mode that can.
+
+    Position and Altitude fall back to Stabilized, as long as there are sticks. Every other mode falls back to Return,
+    Land and Descend (failsafe.cpp, checkModeFallback), of which only Descend can run: level, going down.
+    """
+    acts = decision is not None and decision.action is not Action.NONE
+    flown = decision.action.mode if decision is not None and acts else intended
+    if flown is None or not flown.needs_estimate:
+        return decision
+    cause = decision.cause if decision is not None and acts else Cause.ESTIMATE_LOST
+    by_hand = sticks_ok and flown in (Mode.POSITION, Mode.ALTITUDE)
+    return Decision(Action.STABILIZED if by_hand else Action.DESCEND, cause)
 
 
 def _link_decision(intended: Mode, health: Health, parameters: Parameters) -> Decision | None:

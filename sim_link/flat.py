@@ -37,14 +37,14 @@ FORCE = 69
 WORLD = 72
 """Ground's down coordinate [m], step [s]."""
 BODY = 74
-BODY_NUMBERS = 21
-GAINS = 95
+BODY_NUMBERS = 25
+GAINS = 99
 GAINS_NUMBERS = 36
-SIGMAS = 131
-RING_ROWS = 135
-RING_NEXT = 136
+SIGMAS = 135
+RING_ROWS = 139
+RING_NEXT = 140
 """Row of the ring that the next step overwrites: the oldest."""
-NOISE = 137
+NOISE = 141
 NOISE_NUMBERS = 12
 RING = NOISE + NOISE_NUMBERS * NOISE_ROWS
 RING_NUMBERS = 13
@@ -64,11 +64,12 @@ def run_steps(x: MutableSequence[float]) -> None:
     setpoint = Setpoint(int(x[34]), x[35], (x[36], x[37], x[38]), (x[39], x[40], x[41], x[42]), x[43],
                         (x[44], x[45], x[46]))  # fmt: skip
     body = Body(x[74], (x[75], x[76], x[77]), x[78], x[79], x[80], x[81], x[82], (x[83], x[84], x[85], x[86]),
-                (x[87], x[88], x[89], x[90]), (x[91], x[92], x[93], x[94]))  # fmt: skip
-    gains = LoopGains((x[95], x[96], x[97]), (x[98], x[99], x[100]), (x[101], x[102], x[103]), x[104], x[105],
-                      (x[106], x[107], x[108]), x[109], (x[110], x[111], x[112]), x[113],
-                      (x[114], x[115], x[116], x[117]), (x[118], x[119], x[120], x[121]),
-                      (x[122], x[123], x[124], x[125]), (x[126], x[127], x[128], x[129]), x[130])  # fmt: skip
+                (x[87], x[88], x[89], x[90]), (x[91], x[92], x[93], x[94]),
+                (x[95], x[96], x[97], x[98]))  # fmt: skip
+    gains = LoopGains((x[99], x[100], x[101]), (x[102], x[103], x[104]), (x[105], x[106], x[107]), x[108], x[109],
+                      (x[110], x[111], x[112]), x[113], (x[114], x[115], x[116]), x[117],
+                      (x[118], x[119], x[120], x[121]), (x[122], x[123], x[124], x[125]),
+                      (x[126], x[127], x[128], x[129]), (x[130], x[131], x[132], x[133]), x[134])  # fmt: skip
     air = (x[66], x[67], x[68])
     force = (x[69], x[70], x[71])
     fresh = x[FRESH] > 0.5

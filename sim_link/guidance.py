@@ -21,6 +21,9 @@ _STOPPED_M_S = 0.3
 _NEAR_M = 0.3
 _TURN_FROM_M = 2.0
 """Further away than this a mission turns the nose to where it flies."""
+_SLIP_LEAST_M = 0.001
+_BLIND_DESCENT_M_S2 = 0.3
+"""Downwards, when there is no estimate to descend by (FlightTaskDescend.cpp)."""
 _RETURN_NEAR_M = 10.0
 """Closer to home than this, Return neither climbs nor cruises (PX4: RTL_MIN_DIST)."""
 
@@ -57,6 +60,9 @@ class Guidance:
         self._target_yaw = math.nan
         self._height: float | None = None
         self._here = home
+        self._slip: Vec3 = (0.0, 0.0, 0.0)
+        """How far a point that is held is off where it should be: what is left of the estimate's jumps."""
+        self._slip_m_s = 0.0
 
     def enter(self, mode: Mode, p: Vec3, v: Vec3, yaw: float, anchor: Vec3 | None = None) -> None:
         """Begin a mode at the present position and velocity; `anchor`: a point to hold, so that nothing moves."""
@@ -71,6 +77,7 @@ class Guidance:
         self._height = None
         self.speed_m_s = None
         self._return_stage = 0
+        self._slip, self._slip_m_s = (0.0, 0.0, 0.0), 0.0
         climb = self._parameters.number("RTL_RETURN_ALT")
         self._return_to = self._nearest_return(p)
         near = math.hypot(p[0] - self._return_to[0], p[1] - self._return_to[1]) < _RETURN_NEAR_M
@@ -116,8 +123,47 @@ class Guidance:
             return descent(self.sticks or CENTRED, self._parameters) < 0.0
         return self._mode is Mode.TAKEOFF
 
+    def shift(self, dp_m: Vec3, dv_m_s: Vec3, dyaw_rad: float) -> None:
+        """Take note that the estimate has jumped.
+
+        Heading and velocity setpoints move along, and so do points that are held with the sticks. Where the vehicle
+        flies itself the points are places on the Earth: it goes smoothly to where it now believes them to be.
+        """
+        self._yaw += dyaw_rad
+        self._v = _sum(self._v, dv_m_s)
+        if self._mode in (Mode.POSITION, Mode.ALTITUDE):
+            if self._anchor is not None:
+                self._anchor = _sum(self._anchor, dp_m)
+            if self._height is not None:
+                self._height += dp_m[2]
+        else:
+            self._slip = _sum(self._slip, dp_m)
+
     def setpoint(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
         """Give the setpoint for the position controller; dt_s is the time since the last call."""
+        target = self._task(p, v, dt_s)
+        if self._slip == (0.0, 0.0, 0.0):
+            return target
+        if all(map(math.isnan, target.p)):
+            self._slip, self._slip_m_s = (0.0, 0.0, 0.0), 0.0  # no point is held that could be off
+            return target
+        self._slide(dt_s)
+        return target._replace(p=_sum(target.p, self._slip))
+
+    def _slide(self, dt_s: float) -> None:
+        """Let the slip go: from rest to rest, within MPC_ACC_HOR and MPC_XY_CRUISE."""
+        length = math.hypot(*self._slip)
+        limit = self._parameters.within("MPC_ACC_HOR", 0.1, 1000.0)
+        fastest = min(self._parameters.within("MPC_XY_CRUISE", 0.1, 1000.0), math.sqrt(2.0 * limit * length))
+        self._slip_m_s = min(self._slip_m_s + limit * dt_s, fastest)
+        share = 1.0 - self._slip_m_s * dt_s / length if length > _SLIP_LEAST_M else 0.0
+        if share <= 0.0:
+            self._slip, self._slip_m_s = (0.0, 0.0, 0.0), 0.0
+        else:
+            self._slip = (share * self._slip[0], share * self._slip[1], share * self._slip[2])
+
+    def _task(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
+        """Give the setpoint of the mode in charge."""
         if self._mode is Mode.TAKEOFF:
             return self._takeoff(p, v, dt_s)
         if self._mode is Mode.MISSION:
@@ -130,6 +176,10 @@ class Guidance:
             return self._return(p, v, dt_s)
         if self._mode is Mode.ALTITUDE:
             return self._altitude(p, v, dt_s)
+        if self._mode is Mode.DESCEND:
+            # Nobody knows position, height and speed: level, with a little less thrust than would hover.
+            self.descending = True
+            return PositionSetpoint(_NOTHING, _NOTHING, (0.0, 0.0, _BLIND_DESCENT_M_S2), self._yaw, 0.0)
         return self._hold(p, v, dt_s)
 
     def _hold(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
@@ -227,8 +277,8 @@ class Guidance:
         return self._parameters.number("MPC_Z_VEL_MAX_DN" if high else "MPC_LAND_SPEED")
 
     def _turn(self, yaw: float, dt_s: float) -> None:
-        """Turn the heading towards `yaw` [rad]; NaN: it stays."""
-        if math.isnan(yaw):
+        """Turn the heading towards `yaw` [rad]; NaN, or what is no direction: it stays."""
+        if not math.isfinite(yaw):
             return
         error = math.remainder(yaw - self._yaw, 2.0 * math.pi)
         most = math.radians(self._parameters.within("MPC_YAWRAUTO_MAX", 0.0, 360.0)) * dt_s
@@ -303,3 +353,7 @@ class Guidance:
         down = self._parameters.within("MPC_ACC_DOWN_MAX", 0.1, 1000.0) * dt_s
         vertical = min(max(wanted[2] - self._v[2], -up), down)
         self._v = (self._v[0] + share * north, self._v[1] + share * east, self._v[2] + vertical)
+
+
+def _sum(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])

@@ -35,6 +35,7 @@ from .rotation import (
 __all__ = [
     "ATTITUDE",
     "RATES",
+    "ROTORS",
     "STOPPED",
     "STOPPED_SETPOINT",
     "TORQUE",
@@ -62,6 +63,8 @@ ATTITUDE = 2
 """Attitude, yaw-rate feed-forward and thrust."""
 TORQUE = 3
 """Normalised torque and thrust, straight into allocation (SET_ACTUATOR_CONTROL_TARGET)."""
+ROTORS = 4
+"""Commands of the rotors, past all loops: another autopilot flies (`hil`)."""
 
 _RATE_INPUT_MAX_RAD_S = 1.0e3
 """Keeps infinite inputs finite; far beyond what any axis can do."""
@@ -75,13 +78,14 @@ class Setpoint(NamedTuple):
     """What the inner loops follow until the next one; NaN and infinity are taken as they come from the wire."""
 
     mode: int
-    """STOPPED, RATES, ATTITUDE or TORQUE."""
+    """STOPPED, RATES, ATTITUDE, TORQUE or ROTORS."""
     thrust: float
     """Collective thrust as a share of 4 rotor_thrust_max_n, 0..1; NaN stops the rotors."""
     rates: Vec3
     """Body rates [rad/s] (RATES); a NaN holds the rate measured when the setpoint arrived."""
     q: Quat
-    """Attitude (ATTITUDE), need not be normalised; zero or NaN is not an attitude, see `filtered_attitude`."""
+    """Attitude (ATTITUDE), need not be normalised; zero or NaN is not an attitude, see `filtered_attitude`. With ROTORS
+    no attitude, but the four commands 0..1, before the thrust curve; NaN stops a rotor."""
     yaw_rate: float
     """Feed-forward about the inertial z axis [rad/s] (ATTITUDE); NaN = none."""
     torque: Vec3
@@ -258,9 +262,9 @@ def control(
     """
     w = rigid.w
     age = loops.reference_age_s + dt_s
-    if setpoint.mode == STOPPED:
+    if setpoint.mode in (STOPPED, ROTORS):
         idle = LoopState((0.0, 0.0, 0.0), w, (0.0, 0.0, 0.0), loops.q_ref, loops.w_ref, age)
-        return (0.0, 0.0, 0.0, 0.0), idle
+        return setpoint.q if setpoint.mode == ROTORS else (0.0, 0.0, 0.0, 0.0), idle
     q_ref = loops.q_ref
     w_ref = loops.w_ref
     rates = loops.rates

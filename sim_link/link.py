@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, Encoder
+from .datagram_faults import LinkFaults
 from .link_rates import GROUND_HZ, ONBOARD_HZ
 
 __all__ = ["GROUND_HZ", "ONBOARD_HZ", "Link", "Stream"]
@@ -36,6 +37,8 @@ class Link:
         """Frames to send, one datagram each."""
         self.parameters_to_send: deque[str] = deque()
         """Names of a parameter list under way."""
+        self.faults: LinkFaults | None = None
+        """What happens to the datagrams on their way, while anything does: whoever owns the socket asks it."""
         self.quiet = quiet
         """Sends its heartbeat only, until somebody has spoken on it."""
         self._next_us = 0

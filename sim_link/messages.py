@@ -17,7 +17,7 @@ from .estimator import Estimate
 from .geodesy import global_position
 from .modes import FLAG_ARMED, Mode
 from .parameters import Parameters
-from .rotation import Vec3, yaw_of
+from .rotation import Vec3, clip, yaw_of
 from .vehicle_file import VehicleFile
 
 _LOCAL_NED = 1
@@ -44,6 +44,7 @@ CAPABILITY_SET_ACTUATOR_TARGET = 1024
 _VERSIONS = {"1.18": (1, 18, 0), "1.13": (1, 13, 3)}
 _ATTITUDE = mavlink.MAVLink_attitude_message.unpacker
 _TEXT_LENGTH = 50
+_HEADING_UNKNOWN = 65535
 _RELEASE = 255
 """FIRMWARE_VERSION_TYPE_OFFICIAL"""
 
@@ -66,6 +67,8 @@ class Telemetry:
         self._covariances = self._pack_covariances(vehicle)
         self.reset_counter = 0
         """Of the estimator: any change tells receivers to start their filters anew."""
+        self.stamp_shift_us = 0
+        """Added to the stamps of state messages that are stamped with the time of publication."""
         self._builders: dict[int, Callable[[], Payload | None]] = {
             codec.ID_HEARTBEAT: self.heartbeat,
             codec.ID_ODOMETRY: self.odometry,
@@ -86,6 +89,15 @@ class Telemetry:
         self._t_us = t_us
         self._estimate = estimate
         self.rates = rates
+
+    @property
+    def sample_us(self) -> int:
+        """Stamp of the estimate that is told."""
+        return self._estimate.t_us
+
+    def _published_ms(self) -> int:
+        """Give the stamp of a state message that tells the time of publication."""
+        return max(0, self._t_us + self.stamp_shift_us) // 1000
 
     def add(self, builders: Mapping[int, Callable[[], Payload | None]]) -> None:
         """Take in messages that are built elsewhere."""
@@ -110,43 +122,57 @@ class Telemetry:
             velocity[index] = (vehicle.noise_velocity_m_s if k < 3 else vehicle.noise_rate_rad_s) ** 2
         return codec.COVARIANCE.pack(*pose) + codec.COVARIANCE.pack(*velocity)
 
-    def odometry(self) -> bytes:
-        """ODOMETRY: velocity is NED although PX4 could name a body frame; time_usec is the sample's."""
+    def odometry(self) -> bytes | None:
+        """ODOMETRY: velocity is NED although PX4 could name a body frame; time_usec is the sample's.
+
+        None while there is no estimate, as for the other messages that tell one.
+        """
+        if not self._autopilot.has_estimate:
+            return None
         t_us, p, v, q, w = self._estimate
         return codec.ODOMETRY.pack(
             t_us, *p, *q, *v, *w, self._covariances, _LOCAL_NED, _LOCAL_NED, self.reset_counter, _ESTIMATOR_AUTOPILOT, 0
         )
 
-    def attitude_quaternion(self) -> bytes:
+    def attitude_quaternion(self) -> bytes | None:
         """ATTITUDE_QUATERNION, stamped with the sample's time."""
+        if not self._autopilot.has_estimate:
+            return None
         e = self._estimate
         return codec.ATTITUDE_QUATERNION.pack(e.t_us // 1000, *e.q, *e.w, 0.0, 0.0, 0.0, 0.0)
 
-    def attitude(self) -> bytes:
+    def attitude(self) -> bytes | None:
         """ATTITUDE: Euler angles."""
+        if not self._autopilot.has_estimate:
+            return None
         e = self._estimate
         return bytes(_ATTITUDE.pack(e.t_us // 1000, *euler(e.q), *e.w))
 
-    def local_position(self) -> bytes:
+    def local_position(self) -> bytes | None:
         """LOCAL_POSITION_NED: PX4 stamps it with the time of publication, not of the sample."""
+        if not self._autopilot.has_estimate:
+            return None
         e = self._estimate
-        return codec.LOCAL_POSITION_NED.pack(self._t_us // 1000, *e.p, *e.v)
+        return codec.LOCAL_POSITION_NED.pack(self._published_ms(), *e.p, *e.v)
 
-    def global_position(self) -> bytes:
-        """GLOBAL_POSITION_INT."""
+    def global_position(self) -> bytes | None:
+        """GLOBAL_POSITION_INT; what is no number becomes 0, a heading that is none the value for unknown."""
+        if not self._autopilot.has_estimate:
+            return None
         e = self._estimate
         latitude, longitude, altitude_m = global_position(e.p)
-        heading = math.degrees(yaw_of(e.q)) % 360.0
+        yaw = yaw_of(e.q)
+        heading = int(100.0 * (math.degrees(yaw) % 360.0)) % 36000 if math.isfinite(yaw) else _HEADING_UNKNOWN
         above_home_m = self._autopilot.guidance.home[2] - e.p[2]
         speeds = [_int16(100.0 * x) for x in e.v]
         return codec.GLOBAL_POSITION_INT.pack(
-            self._t_us // 1000,
+            self._published_ms(),
             latitude,
             longitude,
             _int32(1000.0 * altitude_m),
             _int32(1000.0 * above_home_m),
             *speeds,
-            int(100.0 * heading) % 36000,
+            heading,
         )
 
     def attitude_target(self) -> bytes | None:
@@ -198,10 +224,9 @@ class Telemetry:
         return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
 
     def estimator_status(self) -> Any:
-        """ESTIMATOR_STATUS: all that offboard control needs is valid."""
-        return mavlink.MAVLink_estimator_status_message(
-            self._t_us, _ESTIMATOR_FLAGS, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.1
-        )
+        """ESTIMATOR_STATUS: all that offboard control needs is valid; nothing is while there is no estimate."""
+        flags = _ESTIMATOR_FLAGS if self._autopilot.has_estimate else 0
+        return mavlink.MAVLink_estimator_status_message(self._t_us, flags, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.1)
 
     def home_position(self) -> Any:
         """HOME_POSITION."""
@@ -271,7 +296,8 @@ def euler(q: tuple[float, float, float, float]) -> Vec3:
     """Give roll, pitch and yaw [rad] of an attitude."""
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    return roll, math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x)))), yaw_of(q)
+    sine = 2.0 * (w * y - z * x)
+    return roll, math.asin(clip(sine, -1.0, 1.0)), yaw_of(q)
 
 
 def _int16(value: float) -> int:

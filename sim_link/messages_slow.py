@@ -138,8 +138,10 @@ class SlowTelemetry:
 
     # State
 
-    def vfr_hud(self) -> bytes:
-        """VFR_HUD: there is no airspeed sensor."""
+    def vfr_hud(self) -> bytes | None:
+        """VFR_HUD: there is no airspeed sensor; None while there is no estimate."""
+        if not self._autopilot.has_estimate:
+            return None
         e = self._estimate
         throttle = self._autopilot.held.thrust if self._autopilot.armed else 0.0
         percent = _whole(100.0 * throttle, 0, 100)
@@ -148,8 +150,14 @@ class SlowTelemetry:
         return _pack("VFR_HUD", 0.0, ground, HOME_ALTITUDE_M - e.p[2], -e.v[2], heading, percent)
 
     def altitude(self) -> bytes:
-        """ALTITUDE: above sea level, above the local origin, above home; the terrain is flat at the origin's height."""
+        """ALTITUDE: above sea level, above the local origin, above home; the terrain is flat at the origin's height.
+
+        Without an estimate only the barometer's height, which never jumps (altitude_monotonic), is there.
+        """
         e = self._estimate
+        if not self._autopilot.has_estimate:
+            monotonic, none = HOME_ALTITUDE_M - self._now.rigid.p[2], math.nan
+            return _pack("ALTITUDE", self._t_us, monotonic, none, none, none, HOME_ALTITUDE_M, none)
         amsl = HOME_ALTITUDE_M - e.p[2]
         above_home = self._autopilot.guidance.home[2] - e.p[2]
         return _pack("ALTITUDE", self._t_us, amsl, amsl, -e.p[2], above_home, HOME_ALTITUDE_M, -e.p[2])
@@ -235,6 +243,8 @@ class SlowTelemetry:
             health &= ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
         if autopilot.breach is not None:
             health &= ~_FENCE
+        if not autopilot.has_estimate:
+            health &= ~mavlink.MAV_SYS_STATUS_AHRS
         if battery.charge_state > CHARGE_LOW:
             health &= ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
         return mavlink.MAVLink_sys_status_message(
@@ -309,7 +319,7 @@ class SlowTelemetry:
         """NAV_CONTROLLER_OUTPUT: attitude setpoint, and bearing and distance to where it flies."""
         autopilot, e = self._autopilot, self._estimate
         target = autopilot.position_setpoint
-        if target is None or not autopilot.armed or autopilot.held.mode == STOPPED:
+        if target is None or not autopilot.has_estimate or not autopilot.armed or autopilot.held.mode == STOPPED:
             return None
         roll, pitch, yaw = (math.degrees(x) for x in euler(autopilot.held.q))
         north, east = _or_zero(target.p[0] - e.p[0]), _or_zero(target.p[1] - e.p[1])

@@ -16,7 +16,7 @@ MISSION, FENCE, RALLY, ALL = 0, 1, 2, 255
 MAX_ITEMS = {MISSION: 500, FENCE: 64, RALLY: 32}
 
 ACCEPTED, ERROR, UNSUPPORTED_FRAME, UNSUPPORTED, NO_SPACE, INVALID = 0, 1, 2, 3, 4, 5
-INVALID_PARAM1, INVALID_X, INVALID_Y, INVALID_Z = 6, 10, 11, 12
+INVALID_PARAM1, INVALID_PARAM2, INVALID_X, INVALID_Y, INVALID_Z = 6, 7, 10, 11, 12
 OPERATION_CANCELLED = 15
 """MAV_MISSION_RESULT"""
 
@@ -94,6 +94,8 @@ def refusal(kind: int, item: Item) -> int:
         return INVALID_PARAM1
     if item.command in (JUMP, DELAY) and not math.isfinite(first):
         return INVALID_PARAM1
+    if item.command == JUMP and not math.isfinite(item.params[1]):
+        return INVALID_PARAM2
     return ACCEPTED
 
 

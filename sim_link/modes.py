@@ -50,6 +50,7 @@ class Mode(Enum):
     MISSION = _Row("Mission", MAIN_AUTO, 4, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, True, 6)
     RETURN = _Row("Return", MAIN_AUTO, 5, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, False, 5)
     LAND = _Row("Land", MAIN_AUTO, 6, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, False, 7)
+    DESCEND = _Row("Descend", MAIN_AUTO, 20, FLAG_AUTO | FLAG_STABILIZE | FLAG_GUIDED, False, False)
     TERMINATION = _Row("Termination", MAIN_TERMINATION, 0, 0, False, False)
 
     @property
@@ -78,14 +79,24 @@ class Mode(Enum):
         return self.value.can_arm
 
     @property
+    def needs_estimate(self) -> bool:
+        """Whether the mode cannot run without position or height; Offboard needs them for some setpoints only."""
+        return self in _WITH_ESTIMATE
+
+    @property
     def standard(self) -> int:
         """MAV_STANDARD_MODE; 0: none."""
         return self.value.standard
 
 
+_WITH_ESTIMATE = frozenset(
+    (Mode.ALTITUDE, Mode.POSITION, Mode.TAKEOFF, Mode.HOLD, Mode.MISSION, Mode.RETURN, Mode.LAND)
+)
+
+
 def available_modes() -> list[Mode]:
-    """Give the modes that can be chosen, in the order of AVAILABLE_MODES."""
-    return [mode for mode in Mode if mode is not Mode.TERMINATION]
+    """Give the modes that can be chosen, in the order of AVAILABLE_MODES; the others come by a failsafe only."""
+    return [mode for mode in Mode if mode not in (Mode.TERMINATION, Mode.DESCEND)]
 
 
 def from_base_mode(flags: int) -> Mode | None:
@@ -104,7 +115,7 @@ def from_standard_mode(number: int | None) -> Mode | None:
     return next((mode for mode in Mode if number and mode.standard == number), None)
 
 
-_BY_NUMBERS = {(mode.value.main, mode.value.sub): mode for mode in Mode}
+_BY_NUMBERS = {(mode.value.main, mode.value.sub): mode for mode in Mode if mode is not Mode.DESCEND}
 
 
 def from_numbers(main: int, sub: int) -> Mode | None:

@@ -15,7 +15,7 @@ from .geodesy import HOME_ALTITUDE_M, local_position
 from .inner_loops import ATTITUDE, RATES, STOPPED, TORQUE, Setpoint
 from .parameters import Parameters
 from .position_loop import PositionSetpoint
-from .rotation import Quat, Vec3, rotate, yaw_of
+from .rotation import Quat, Vec3, from_yaw, multiply, rotate, yaw_of
 
 ROLL_RATE_IGNORE = 1
 PITCH_RATE_IGNORE = 2
@@ -240,6 +240,23 @@ class Offboard:
             return self._flyable
         return PositionSetpoint(_NOTHING, (0.0, 0.0, 0.0), _NOTHING, math.nan, 0.0)
 
+    @property
+    def wants_trajectory(self) -> bool:
+        """Whether the last message was one for the position controller: it needs an estimate of the position."""
+        return self._wants == TRAJECTORY
+
+    def shift(self, dp_m: Vec3, dv_m_s: Vec3, dyaw_rad: float) -> None:
+        """Move the setpoints in force along with an estimate that has jumped, as PX4 does.
+
+        Nothing moves for the jump until the next setpoint comes, which is meant in the new frame.
+        """
+        if self._trajectory is not None:
+            self._trajectory = _shifted(self._trajectory, dp_m, dv_m_s, dyaw_rad)
+        if self._flyable is not None:
+            self._flyable = _shifted(self._flyable, dp_m, dv_m_s, dyaw_rad)
+        if self._attitude is not None and dyaw_rad != 0.0:
+            self._attitude = self._attitude._replace(q=multiply(from_yaw(dyaw_rad), self._attitude.q))
+
     def enter(self, now_us: int) -> None:
         """Start following: the vehicle has changed to OFFBOARD. What was held from earlier is not used again."""
         self._under_way.clear()
@@ -338,6 +355,13 @@ def _given(vector: Vec3, mask: int, first_bit: int) -> Vec3:
 def _whole_vector(vector: Vec3, mask: int, first_bit: int) -> Vec3:
     """Give a vector, or nothing when the mask ignores any axis: so PX4 does in the body frame."""
     return _NOTHING if mask & 7 * first_bit or not all(map(math.isfinite, vector)) else vector
+
+
+def _shifted(setpoint: PositionSetpoint, dp: Vec3, dv: Vec3, dyaw: float) -> PositionSetpoint:
+    """Move a setpoint; what it says nothing about stays so."""
+    p, v, a, yaw, yaw_rate = setpoint
+    p = (p[0] + dp[0], p[1] + dp[1], p[2] + dp[2])
+    return PositionSetpoint(p, (v[0] + dv[0], v[1] + dv[1], v[2] + dv[2]), a, yaw + dyaw, yaw_rate)
 
 
 def _is_empty(vector: Vec3) -> bool:

@@ -46,6 +46,15 @@ class Orders:
         """What the position controller flies, or flew last; None: nothing yet."""
         return self._steering.target
 
+    def shift(self, dv_m_s: Vec3, dyaw_rad: float) -> None:
+        """Take note that the estimate of velocity and heading has jumped."""
+        self._steering.shift(dv_m_s)
+        self._attitude_sticks.turn(dyaw_rad)
+
+    def needs_estimate(self, mode: Mode) -> bool:
+        """Tell whether the position controller flies."""
+        return self._offboard.follows_trajectory if mode is Mode.OFFBOARD else mode.needs_estimate
+
     def nothing(self) -> Order:
         """Stop the rotors."""
         self._rest()

@@ -14,7 +14,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .codec import ID_TIMESYNC, TIMESYNC, Frame, timesync
+from .codec import ID_SERIAL_CONTROL, ID_TIMESYNC, TIMESYNC, Frame, timesync
+from .fault_shell import FaultShell
 from .link import Link
 from .truth_log import TruthLog, row
 from .udp import Address, UdpEndpoint
@@ -79,7 +80,8 @@ class Peer:
             vehicle: what to run.
             options: ports and time.
             stopped: asked often; once it says yes, `run` returns.
-            notice: gets a sentence when the companion falls silent in lockstep, and when it is back.
+            notice: gets a sentence when the companion falls silent in lockstep, when it is back, and when a fault
+                begins or ends.
 
         Raises:
             PortError: a port is in use.
@@ -103,6 +105,10 @@ class Peer:
         self.synchronous = options.lockstep
         """Whether the clock waits for the companion; False while a silent one lets it run at real time."""
         vehicle.asks_time = not options.lockstep
+        vehicle.faults.tell = notice
+        if options.lockstep:
+            vehicle.faults.effects.set_lockstep()
+        self._shell = FaultShell(vehicle.faults, vehicle.system)
         self._truth_log: TruthLog | None = None
         self._stopped = stopped
         self._notice = notice
@@ -129,10 +135,11 @@ class Peer:
     def run(self, duration_s: float | None = None) -> None:
         """Run until told to stop, or for a time of the vehicle's."""
         end_us = None if duration_s is None else self.vehicle.start_us + round(duration_s * 1e6)
+        physics = self.vehicle.airframe  # its time goes on through a reboot
         if not self._started and not self._wait_for_companion():
             return
         self._deadline_s = time.monotonic()
-        while not self._stopped() and (end_us is None or self.vehicle.t_us < end_us):
+        while not self._stopped() and (end_us is None or physics.t_us < end_us):
             self.step()
 
     def step(self) -> None:
@@ -141,6 +148,10 @@ class Peer:
         vehicle.tick(self._send_state)
         if vehicle.truth_outbox:
             self._flush()
+        for link in vehicle.links:
+            if link.faults is not None:
+                for frame in link.faults.released():
+                    self._obey(frame, link)
         # The companion is at work now: what else there is to do costs nobody any time.
         vehicle.look_ahead()
         text = "" if log is None else row(vehicle.airframe.truth())
@@ -168,6 +179,7 @@ class Peer:
                 endpoint.close()
         if self._truth_log is not None:
             self._truth_log.close()
+        self.vehicle.faults.close()
 
     # Waiting
 
@@ -185,6 +197,9 @@ class Peer:
                 self._serve_ground()
                 datagram = self.companion.receive()
                 if datagram is not None and datagram[0]:
+                    if datagram[0][0].msg_id == ID_SERIAL_CONTROL:
+                        self._act(*datagram)
+                        continue
                     self._waiting.append(datagram)
                     self._started = True
                     return True
@@ -278,29 +293,44 @@ class Peer:
 
     def _act(self, found: list[Frame], sender: Address) -> None:
         """Act on the messages of one datagram."""
+        link = self.vehicle.companion
+        if link.faults is not None:
+            found = link.faults.incoming(found)
         for frame in found:
             if frame.msg_id == ID_TIMESYNC:
-                self._timesync(frame, self.vehicle.companion, sender == self.companion.partner)
+                self._timesync(frame, link, sender == self.companion.partner)
+            elif frame.msg_id == ID_SERIAL_CONTROL:
+                self.companion.answer(self._shell.take(frame, sender), sender)
             else:
-                self.vehicle.receive(frame, self.vehicle.companion)
+                self.vehicle.receive(frame, link)
 
     def _serve_ground(self) -> None:
         """Act on what the ground link has received."""
         if self.ground is None:
             return
+        link = self.vehicle.ground
         while (datagram := self.ground.receive()) is not None:
-            for frame in datagram[0]:
-                self.vehicle.ground.speak()
-                if frame.msg_id == ID_TIMESYNC:
-                    self._timesync(frame, self.vehicle.ground, False)
-                else:
-                    self.vehicle.receive(frame, self.vehicle.ground)
+            found, sender = datagram
+            for frame in found if link.faults is None else link.faults.incoming(found):
+                if frame.msg_id == ID_SERIAL_CONTROL:
+                    self.ground.answer(self._shell.take(frame, sender), sender)
+                    continue
+                link.speak()
+                self._obey(frame, link)
+
+    def _obey(self, frame: Frame, link: Link) -> None:
+        """Act on a message that is neither an order of faults nor part of the lockstep exchange."""
+        if frame.msg_id == ID_TIMESYNC:
+            self._timesync(frame, link, False)
+        else:
+            self.vehicle.receive(frame, link)
 
     def _timesync(self, frame: Frame, link: Link, from_companion: bool) -> None:
         """Answer a request; take an answer to ours as the end of a lockstep exchange."""
         tc1, ts1 = timesync(frame.payload)
         if tc1 == 0:
-            link.send_hot(ID_TIMESYNC, TIMESYNC.pack(self._now_ns(), ts1, frame.system, frame.component))
+            wrong_ns = 0 if link.faults is None else link.faults.answer_offset_ns
+            link.send_hot(ID_TIMESYNC, TIMESYNC.pack(self._now_ns() + wrong_ns, ts1, frame.system, frame.component))
             return
         # While running free, any answer shows that the companion is back.
         wanted = ts1 == self._awaited_ns or (not self.synchronous and 0 < ts1 <= self._awaited_ns)
@@ -318,6 +348,10 @@ class Peer:
     def _flush(self) -> None:
         """Send what waits in the outboxes."""
         vehicle = self.vehicle
+        for link in vehicle.links:
+            if link.faults is not None:
+                link.faults.outgoing(link.outbox)
+                self.companion.together = False  # what is wrong with one frame must not reach another
         if vehicle.companion.outbox:
             self.companion.send(vehicle.companion.outbox)
         if self.ground is not None:

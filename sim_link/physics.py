@@ -54,6 +54,8 @@ class Body(NamedTuple):
     """Positions to the right."""
     rotor_yaw_m: Vec4
     """Yaw moment per newton of thrust; positive turns the nose right."""
+    rotor_share: Vec4
+    """Of its thrust that each rotor still gives at a command; 1 = whole, 0 = it stands still."""
 
 
 class RigidState(NamedTuple):
@@ -84,6 +86,7 @@ def make_body(vehicle: VehicleFile, gravity_m_s2: float) -> Body:
         vehicle.rotor_x_m,
         vehicle.rotor_y_m,
         vehicle.rotor_yaw_m,
+        (1.0, 1.0, 1.0, 1.0),
     )
 
 
@@ -93,7 +96,7 @@ def at_rest(p: Vec3, yaw: float, rotor_n: Vec4) -> RigidState:
 
 
 def rotor_target(command: float, body: Body) -> float:
-    """Return the thrust [N] on which a rotor settles: command kept to 0..1, then the thrust curve; NaN stands still."""
+    """Return the thrust [N] on which a whole rotor settles: command kept to 0..1, the thrust curve; NaN: it stands."""
     if not command > 0.0:
         return 0.0
     u = min(command, 1.0)
@@ -214,10 +217,10 @@ def step(state: RigidState, command: Vec4, air: Vec3, force_n: Vec3, body: Body,
         dt_s: length of the step [s].
     """
     target = (
-        rotor_target(command[0], body),
-        rotor_target(command[1], body),
-        rotor_target(command[2], body),
-        rotor_target(command[3], body),
+        body.rotor_share[0] * rotor_target(command[0], body),
+        body.rotor_share[1] * rotor_target(command[1], body),
+        body.rotor_share[2] * rotor_target(command[2], body),
+        body.rotor_share[3] * rotor_target(command[3], body),
     )
     lag = body.rotor_lag_s
     left_half = math.exp(-0.5 * dt_s / lag) if lag > 0.0 else 0.0

@@ -15,8 +15,8 @@ from .physics import RigidState
 from .rotation import Vec3, rotate_back
 
 _GRAVITY_M_S2 = 9.80665
-_FIELD_G: Vec3 = (0.215, 0.010, 0.430)
-"""Magnetic field of the Earth at home, NED [gauss]."""
+FIELD_G: Vec3 = (0.2175, 0.0129, 0.4304)
+"""Magnetic field of the Earth at home, NED [gauss]: declination 3.4 degrees, as PX4's world magnetic model has it."""
 _NOISE_M_S2, _NOISE_RAD_S, _NOISE_G, _NOISE_HPA = 0.05, 0.002, 0.002, 0.02
 _KEY = struct.Struct("<qq")
 _NUMBERS = 10
@@ -45,7 +45,7 @@ def sample(seed: int, t_us: int, rigid: RigidState, acceleration: Vec3) -> Sampl
     noise = _normal_numbers(seed, t_us)
     a = acceleration
     force = rotate_back(rigid.q, (a[0], a[1], a[2] - _GRAVITY_M_S2))
-    field = rotate_back(rigid.q, _FIELD_G)
+    field = rotate_back(rigid.q, FIELD_G)
     pressure = pressure_hpa(HOME_ALTITUDE_M - rigid.p[2]) + _NOISE_HPA * noise[9]
     return Sample(
         _noisy(force, _NOISE_M_S2, noise[0:3]),

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from . import codec, file_transfer
 from .autopilot import Autopilot
 from .codec import AUTOPILOT_COMPONENT, Decoder, Frame, mavlink
-from .commands import Commands
+from .commands import Commands, Failures
 from .link import Link
 from .messages import Telemetry
 from .mission_protocol import MissionProtocol
@@ -45,12 +45,21 @@ _NAME_LENGTH = 16
 class Services:
     """Acts on what is received. One object serves all links of a vehicle."""
 
-    def __init__(self, autopilot: Autopilot, parameters: Parameters, telemetry: Telemetry, *, system: int) -> None:
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        parameters: Parameters,
+        telemetry: Telemetry,
+        *,
+        system: int,
+        failures: Failures | None = None,
+    ) -> None:
+        """Serve one vehicle; `failures`: who knows which commands are refused, and lets units fail."""
         self._autopilot = autopilot
         self._parameters = parameters
         self._system = system
         self._decoder = Decoder()
-        self._commands = Commands(autopilot, parameters, telemetry, system=system)
+        self._commands = Commands(autopilot, parameters, telemetry, system=system, failures=failures)
         flight = autopilot.guidance.mission
         self._missions = MissionProtocol(autopilot.plans, self._say, system=system, select=flight.select)
         self._missions.current = lambda: flight.current

@@ -15,6 +15,7 @@ from .position_loop import (
     initial_position_state,
     position_control,
 )
+from .rotation import Vec3
 
 IDLE = Setpoint(RATES, 0.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), math.nan, (0.0, 0.0, 0.0))
 """Armed on the ground: rotors turning, no thrust."""
@@ -46,6 +47,12 @@ class Steering:
         """Forget: somebody else is in charge, and the controller begins anew."""
         self._state = None
         self._ramp_s = None
+
+    def shift(self, dv_m_s: Vec3) -> None:
+        """Take note that the velocity estimate has jumped: that is no acceleration."""
+        if self._state is not None:
+            a, b = self._state.v_previous, dv_m_s
+            self._state = self._state._replace(v_previous=(a[0] + b[0], a[1] + b[1], a[2] + b[2]))
 
     def begin_takeoff(self) -> None:
         """Let the climb speed grow from nothing: a trajectory takes the vehicle off."""

@@ -32,6 +32,11 @@ class AttitudeSticks:
         """Forget the heading: somebody else is in charge."""
         self._yaw = None
 
+    def turn(self, dyaw_rad: float) -> None:
+        """Take note that the heading estimate has jumped: the vehicle shall not turn for it."""
+        if self._yaw is not None:
+            self._yaw += dyaw_rad
+
     def setpoint(self, mode: Mode, sticks: Sticks, q: Quat, dt_s: float) -> Setpoint:
         """Give what the inner loops shall follow. Nobody holds position or height."""
         thrust = self._thrust(sticks.throttle)

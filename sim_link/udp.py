@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 
-from .codec import Frame, frames
+from .codec import ID_SERIAL_CONTROL, Frame, frames
 
 LOOPBACK = "127.0.0.1"
 _DATAGRAM_MAX = 2048
@@ -80,9 +80,17 @@ class UdpEndpoint:
         except OSError:
             return [], (LOOPBACK, 0)  # an ICMP answer to something sent: nobody is there
         found = frames(datagram)
-        if self.partner is None and found:
-            self.partner = sender
+        if self.partner is None and found and found[0].msg_id != ID_SERIAL_CONTROL:
+            self.partner = sender  # whoever orders faults is no partner
         return found, sender
+
+    def answer(self, outbox: list[bytes], sender: Address) -> None:
+        """Send frames to somebody who need not be the partner."""
+        for frame in outbox:
+            try:
+                self.socket.sendto(frame, sender)
+            except OSError:
+                self.unsent += 1
 
     def close(self) -> None:
         """Give the port back."""

@@ -23,10 +23,15 @@ from .codec import (
     TIMESYNC,
     Frame,
 )
+from .estimator import Estimate
+from .fault_kinds import Fault
+from .faults import Faults
+from .inner_loops import STOPPED_SETPOINT
 from .link import GROUND_HZ, ONBOARD_HZ, Link
 from .loop_gains import LoopGains, make_gains
 from .messages import Telemetry, truth_payload
 from .messages_slow import SlowTelemetry
+from .missions import Plans
 from .offboard import Order
 from .parameters import Parameters
 from .rotation import Vec3
@@ -48,6 +53,8 @@ _OF_THE_PAST = frozenset(
     + (ID_GLOBAL_POSITION_INT,)
 )
 """Messages of what was estimated of the past, and of what the autopilot has decided already."""
+_OF_THE_ESTIMATE = _OF_THE_PAST - {ID_HEARTBEAT, ID_TIMESYNC}
+"""Messages that go out with a new estimate only."""
 
 _LOOP_PARAMETERS = {
     "MC_ROLL_P": (0.0, 20.0),
@@ -105,6 +112,8 @@ class VehicleOptions:
     engine: str = "auto"
     parameters: Mapping[str, int | float] = field(default_factory=dict)
     """Set before the start, over the defaults and what follows from the vehicle file."""
+    faults: tuple[Fault, ...] = ()
+    """What goes wrong, and when; their seed is `seed`."""
 
 
 class Vehicle:
@@ -116,6 +125,7 @@ class Vehicle:
         Raises:
             VehicleError: no whole number of loop steps fits between two states, or a choice is unknown.
             ParameterError: a parameter that does not exist.
+            FaultError: faults that cannot be at the same time, or of a parameter that does not exist.
         """
         if options.px4 not in PX4_VERSIONS:
             raise VehicleError(f"px4 version {options.px4!r}: allowed are {', '.join(PX4_VERSIONS)}")
@@ -133,72 +143,115 @@ class Vehicle:
         self.period_us = self.steps_per_tick * self.airframe.dt_us
         """Time between two states."""
         self.start_us = self.airframe.t_us
-        rigid = self.airframe.inner_state()
-        self.autopilot = Autopilot(
-            self.parameters,
-            px4=options.px4,
-            system=self.system,
-            rigid=rigid,
-            in_air=options.start is not None,
-            now_us=self.airframe.t_us,
-            setpoint_delay_us=round(file.command_delay_s * 1e6),
-            home=(rigid.p[0], rigid.p[1], options.world.ground_d_m),
-        )
-        self.telemetry = Telemetry(
-            file, self.autopilot, self.parameters, instance=options.instance, now=self.airframe.believed()
-        )
-        self.slow = SlowTelemetry(
-            file, self.autopilot, self.parameters, now=self.airframe.believed(), rigid=rigid, seed=options.seed
-        )
-        self.telemetry.add(self.slow.builders)
-        self.services = Services(self.autopilot, self.parameters, self.telemetry, system=self.system)
-        self.telemetry.add({ID_MISSION_CURRENT: self.services.mission_current})
-        self.companion = Link(self.system, ONBOARD_HZ, self.airframe.t_us)
-        self.ground = Link(self.system, GROUND_HZ, self.airframe.t_us, quiet=True)
-        self.links = [self.companion, self.ground]
+        self._boot_us = 0
+        """Time of the physics at which the vehicle's is zero."""
+        self.booting = False
+        """Whether the autopilot is down."""
+        self.faults = Faults(self, options.faults, seed=options.seed)
+        self._start_autopilot(in_air=options.start is not None, ground_home=True)
         self.truth_outbox: list[bytes] = []
         """HIL_STATE_QUATERNION frames with the truth."""
         self.asks_time = True
         """Whether TIMESYNC requests go out with the other messages (in lockstep the peer asks after each state)."""
         self._truth_link = Link(self.system, {}, self.airframe.t_us)
         self._truth_us = self.airframe.t_us
-        self._truth_v = rigid.v
+        self._truth_v = self.airframe.rigid.v
+
+    def _start_autopilot(self, *, in_air: bool, ground_home: bool = False, plans: Plans | None = None) -> None:
+        """Do what a boot does: autopilot, messages, services, links. `ground_home`: home is on the ground below."""
+        options, file, now_us = self.options, self.options.vehicle, self.t_us
+        rigid = self.airframe.inner_state()
+        home = (rigid.p[0], rigid.p[1], options.world.ground_d_m) if ground_home else rigid.p
+        believed = self._dated(self.airframe.believed())
+        self.autopilot = Autopilot(
+            self.parameters,
+            px4=options.px4,
+            system=self.system,
+            rigid=rigid,
+            in_air=in_air,
+            now_us=now_us,
+            setpoint_delay_us=round(file.command_delay_s * 1e6),
+            home=home,
+            plans=plans,
+        )
+        self.telemetry = Telemetry(file, self.autopilot, self.parameters, instance=options.instance, now=believed)
+        self.slow = SlowTelemetry(file, self.autopilot, self.parameters, now=believed, rigid=rigid, seed=options.seed)
+        self.telemetry.add(self.slow.builders)
+        self.services = Services(
+            self.autopilot, self.parameters, self.telemetry, system=self.system, failures=self.faults
+        )
+        self.telemetry.add({ID_MISSION_CURRENT: self.services.mission_current})
+        self.companion = Link(self.system, ONBOARD_HZ, now_us)
+        self.ground = Link(self.system, GROUND_HZ, now_us, quiet=True)
+        self.links = [self.companion, self.ground]
         self._texts = 0
         self._parameters_version = -1
+        self._beliefs_version = self.airframe.beliefs.version
+        self._told_us = self.telemetry.sample_us
+        """Stamp of the estimate that was told last, while estimates may repeat themselves."""
+        self._held_back: list[dict[int, None]] = [{} for _ in self.links]
+        """Messages of each link that wait for a new estimate, in order."""
 
     @property
     def t_us(self) -> int:
-        """Vehicle time."""
-        return self.airframe.t_us
+        """Vehicle time: since boot, so that a reboot sets it back."""
+        return self.airframe.t_us - self._boot_us
+
+    def begin_boot(self) -> None:
+        """Let the autopilot be down: its rotors stop, it hears and says nothing, until `finish_boot`."""
+        self.booting = True
+        self.autopilot.armed = False
+
+    def finish_boot(self, passed_us: int) -> None:
+        """Let the autopilot be there again, disarmed, passed_us after it went down; parameters and plans are kept."""
+        plans, battery, was_quiet = self.autopilot.plans, self.slow.battery, self.ground.quiet
+        self.booting = False
+        self._boot_us = self.airframe.t_us - passed_us
+        self._start_autopilot(in_air=False, plans=plans)
+        self.slow.battery = battery
+        self.ground.quiet = was_quiet
+        self._truth_us = self.t_us
+        self._obey_beliefs()
+
+    def _dated(self, estimate: Estimate) -> Estimate:
+        """Give an estimate of the physics the stamp of the vehicle's time."""
+        return estimate if self._boot_us == 0 else estimate._replace(t_us=max(0, estimate.t_us - self._boot_us))
 
     def receive(self, frame: Frame, link: Link) -> None:
         """Act on a message that came on a link, at the present vehicle time."""
-        self.services.handle(frame, link, self.airframe.t_us)
+        self.services.handle(frame, link, self.t_us)
 
     def tick(self, queued: Callable[[int], None] = _nobody) -> None:
         """Advance by one state period and queue what is due after it.
 
         `queued` is called once, with the vehicle time after the period, as soon as the messages are queued. That is
-        before the physics of the period is computed where they tell nothing but the past: an estimate that is old
-        enough is known already, and the companion can work on it while the vehicle moves.
+        before anything of the period is computed where they tell nothing but the past: an estimate that is old enough
+        is known already, and the companion can work on it while the vehicle decides and moves.
         """
         airframe = self.airframe
-        now_us = airframe.t_us + self.period_us
+        if airframe.t_us >= self.faults.next_us:
+            self.faults.advance(airframe.t_us, self.period_us)
+            if self.booting:
+                self._wait_for_boot(queued)
+                return
+        if airframe.beliefs.version != self._beliefs_version:
+            self._obey_beliefs()
+        now_us = self.t_us + self.period_us
         due = [link.due(now_us, self.period_us) for link in self.links]
-        order, steps = self._decide(self.steps_per_tick)
-        early = steps == self.steps_per_tick <= airframe.age_steps and self._tell_the_past(due)
+        early = self.steps_per_tick <= airframe.age_steps and self._tell_the_past(due)
         if early:
-            self.telemetry.update(now_us, airframe.believed(steps), self.telemetry.rates)
+            believed = self._dated(airframe.believed(self.steps_per_tick))
+            self.telemetry.update(now_us, believed, self.telemetry.rates)
             self._publish(due, now_us)
             queued(now_us)
-        self._move(order, steps)
-        left = self.steps_per_tick - steps
+        left = self.steps_per_tick
         while left > 0:
             order, steps = self._decide(left)
             self._move(order, steps)
             left -= steps
-        self.telemetry.update(now_us, airframe.believed(), airframe.rates_followed())
-        if self.slow.update(now_us, airframe.believed(), airframe.rigid):
+        believed = self._dated(airframe.believed())
+        self.telemetry.update(now_us, believed, airframe.rates_followed())
+        if self.slow.update(now_us, believed, airframe.rigid):
             airframe.set_thrust_factor(self.slow.battery.thrust_factor)
         self.services.update(self.links, now_us)
         if not early:
@@ -206,6 +259,13 @@ class Vehicle:
             queued(now_us)
         if now_us >= self._truth_us:
             self._publish_truth(now_us)
+
+    def _wait_for_boot(self, queued: Callable[[int], None]) -> None:
+        """Advance by one state period while the autopilot is down; vehicle time is that of before still."""
+        self.airframe.advance(STOPPED_SETPOINT, True, self.steps_per_tick)
+        queued(self.t_us)
+        if self.t_us >= self._truth_us:
+            self._publish_truth(self.t_us)
 
     def look_ahead(self) -> None:
         """Prepare the next state's estimate, as far as it is known: done while there is nothing else to do."""
@@ -218,6 +278,8 @@ class Vehicle:
 
     def _publish(self, due: list[Sequence[int]], now_us: int) -> None:
         """Queue the messages that are due on each link, parameters that were asked for, and texts."""
+        if self.airframe.beliefs.active:
+            due = self._without_repeats(due)
         for link, ids in zip(self.links, due, strict=True):
             for msg_id in ids:
                 self._publish_one(link, msg_id, now_us)
@@ -225,6 +287,20 @@ class Vehicle:
                 self.services.send_parameters(link, max(1, _PARAMETERS_PER_S * self.period_us // 1_000_000))
         if self.autopilot.texts:
             self._publish_texts()
+
+    def _without_repeats(self, due: list[Sequence[int]]) -> list[Sequence[int]]:
+        """Hold messages back that would tell the same estimate again; they go out with the next one, as PX4's do."""
+        repeated = self.telemetry.sample_us == self._told_us
+        self._told_us = self.telemetry.sample_us
+        kept: list[Sequence[int]] = []
+        for held, ids in zip(self._held_back, due, strict=True):
+            if repeated:
+                held.update(dict.fromkeys(i for i in ids if i in _OF_THE_ESTIMATE))
+                kept.append([i for i in ids if i not in _OF_THE_ESTIMATE])
+            else:
+                kept.append([*ids, *(i for i in held if i not in ids)])
+                held.clear()
+        return kept
 
     def heartbeat(self) -> None:
         """Queue a HEARTBEAT on every link now, whatever its interval."""
@@ -273,14 +349,14 @@ class Vehicle:
 
         Fewer when a delayed setpoint arrives on the way, or when the autopilot's own period ends.
         """
-        airframe, autopilot = self.airframe, self.autopilot
+        airframe, autopilot, now_us = self.airframe, self.autopilot, self.t_us
         steps = min(left, self._steps_per_control)
         next_us = autopilot.offboard.next_us
-        if next_us is not None and next_us > airframe.t_us:
-            steps = min(steps, -(-(next_us - airframe.t_us) // airframe.dt_us))
+        if next_us is not None and next_us > now_us:
+            steps = min(steps, -(-(next_us - now_us) // airframe.dt_us))
         if self.parameters.version != self._parameters_version:
             self._obey_parameters()
-        return autopilot.update(airframe.t_us, airframe.rigid, steps * airframe.dt_us * 1e-6), steps
+        return autopilot.update(now_us, airframe.inner_state(), steps * airframe.dt_us * 1e-6), steps
 
     def _move(self, order: Order, steps: int) -> None:
         """Run the airframe with an order."""
@@ -290,7 +366,18 @@ class Vehicle:
             steps -= 1
         if steps > 0:
             airframe.advance(order.setpoint, order.fresh, steps)
-        self.autopilot.observe(airframe.t_us, airframe.rigid)
+        self.autopilot.observe(self.t_us, airframe.inner_state())
+
+    def _obey_beliefs(self) -> None:
+        """Let the autopilot and the messages know what has happened to the estimate."""
+        beliefs = self.airframe.beliefs
+        self._beliefs_version = beliefs.version
+        self._told_us = self.telemetry.sample_us
+        self.telemetry.reset_counter = beliefs.reset_counter
+        self.telemetry.stamp_shift_us = beliefs.stamp_shift_us
+        for reset in beliefs.take_resets():
+            self.autopilot.estimate_reset(*reset)
+        self.autopilot.see_estimate(beliefs.available)
 
     def _obey_parameters(self) -> None:
         """Hand changed parameters of the inner loops over to them."""

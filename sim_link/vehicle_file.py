@@ -2,7 +2,7 @@
 
 The companion reads the same file for what it must know ([controller], [limits], `simulated`); those and any other
 sections are none of the simulated vehicle's business and are passed over. Within its own sections every key is
-required and no other is allowed.
+required, but for the bias walk's in [noise], and no other is allowed.
 """
 
 from __future__ import annotations
@@ -73,6 +73,13 @@ class VehicleFile:
     noise_velocity_m_s: float
     noise_attitude_rad: float
     noise_rate_rad_s: float
+    walk_position_m: float = 0.0
+    """Random walk of the position's bias: sigma per axis of what a second adds, as for the other three."""
+    walk_velocity_m_s: float = 0.0
+    walk_yaw_rad: float = 0.0
+    walk_rate_rad_s: float = 0.0
+    walk_time_constant_s: float = 0.0
+    """With which the biases are drawn back to zero; 0: never."""
 
 
 class _Key(NamedTuple):
@@ -85,6 +92,8 @@ class _Key(NamedTuple):
     """0 = one number, else the length of an array of numbers."""
     allowed: str
     check: Callable[[float], bool]
+    default: float | None = None
+    """Of a key that may be left out."""
 
 
 def _positive(value: float) -> bool:
@@ -129,6 +138,11 @@ _KEYS = (
     _Key("noise", "velocity_m_s", "noise_velocity_m_s", 0, "0 or more", _not_negative),
     _Key("noise", "attitude_rad", "noise_attitude_rad", 0, "0 or more", _not_negative),
     _Key("noise", "rate_rad_s", "noise_rate_rad_s", 0, "0 or more", _not_negative),
+    _Key("noise", "position_walk_m_per_sqrt_s", "walk_position_m", 0, "0 or more", _not_negative, 0.0),
+    _Key("noise", "velocity_walk_m_s_per_sqrt_s", "walk_velocity_m_s", 0, "0 or more", _not_negative, 0.0),
+    _Key("noise", "yaw_walk_rad_per_sqrt_s", "walk_yaw_rad", 0, "0 or more", _not_negative, 0.0),
+    _Key("noise", "rate_walk_rad_s_per_sqrt_s", "walk_rate_rad_s", 0, "0 or more", _not_negative, 0.0),
+    _Key("noise", "walk_time_constant_s", "walk_time_constant_s", 0, "0 or more", _not_negative, 0.0),
 )
 _SECTIONS = tuple(dict.fromkeys(k.section for k in _KEYS))
 
@@ -181,22 +195,24 @@ def parse(document: Mapping[str, Any], path: str) -> VehicleFile:
 def _check_section(document: Mapping[str, Any], section: str, path: str) -> None:
     """Raise VehicleFileError unless a section is there, a table, and holds exactly its keys."""
     keys = [k.key for k in _KEYS if k.section == section]
+    required = [k.key for k in _KEYS if k.section == section and k.default is None]
+    must = ", ".join(required)
     if section not in document:
-        raise VehicleFileError(f"{path}: {section}: missing; the section must hold {', '.join(keys)}")
+        raise VehicleFileError(f"{path}: {section}: missing; the section must hold {must}")
     table = document[section]
     if not isinstance(table, Mapping):
-        raise VehicleFileError(f"{path}: {section} = {table!r}: must be a section [{section}] with {', '.join(keys)}")
+        raise VehicleFileError(f"{path}: {section} = {table!r}: must be a section [{section}] with {must}")
     for key in table:
         if key not in keys:
             raise VehicleFileError(f"{path}: {section}.{key}: unknown; allowed are {', '.join(keys)}")
-    for key in keys:
+    for key in required:
         if key not in table:
-            raise VehicleFileError(f"{path}: {section}.{key}: missing; [{section}] must hold {', '.join(keys)}")
+            raise VehicleFileError(f"{path}: {section}.{key}: missing; [{section}] must hold {must}")
 
 
 def _value(table: Mapping[str, Any], key: _Key, path: str) -> float | tuple[float, ...]:
     """Return the number or the array of numbers of a key. Raises VehicleFileError."""
-    raw = table[key.key]
+    raw = table.get(key.key, key.default)
     where = f"{path}: {key.section}.{key.key}"
     if key.length == 0:
         return _number(raw, where, key)

@@ -83,6 +83,20 @@ def flights(base: Path, quick: bool) -> list[tuple[str, str, str]]:
     return rows
 
 
+def wind(base: Path) -> list[tuple[str, str, str]]:
+    """The published test in wind, by the law, and by PX4's own position controller for comparison."""
+    rows = []
+    for speed_m_s, limit in ((0.0, 0.050), (8.5, 0.077), (12.0, 0.123)):
+        blows = f"{-speed_m_s:g},0,0" if speed_m_s else "0,0,0"
+        by_law = f"figure of eight in {speed_m_s:g} m/s of wind"
+        for controller, name, reach in (("law", by_law, f"<= {limit:g}"), ("px4", "  the same by PX4 itself", "")):
+            folder = base / f"wind-{speed_m_s:g}-{controller}"
+            s = demo(folder, "--flight", "windtest", "--wind", blows, "--controller", controller)
+            rms, tilt = s["position_rms_m"], s["tilt_max_rad"]
+            rows.append((f"{name}: position_rms_m", reach, f"{rms:.4f} (tilt to {tilt:.2f} rad)"))
+    return rows
+
+
 def speeds(base: Path, repeats: int) -> list[tuple[str, str, str]]:
     """Lockstep flights with either engine, in turn; and the same seed twice."""
     engines = ["python", *(["numba"] if accelerate.available() else [])]
@@ -152,6 +166,7 @@ def main() -> None:
         base = arguments.out or Path(temporary)
         base.mkdir(parents=True, exist_ok=True)
         rows = steps() + speeds(base, 1 if arguments.quick else 3) + flights(base, arguments.quick)
+        rows += [] if arguments.quick else wind(base)
     print(f"Python {platform.python_version()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
     print("| figure | reach | seen |\n|---|---|---|")
     for row in rows:

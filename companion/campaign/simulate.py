@@ -21,7 +21,7 @@ from companion.config import Flight
 from companion.control import flat
 from companion.control.heading import HeadingState
 from companion.control.law import ControllerState
-from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, Setpoint
+from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, PositionSetpoint, Setpoint
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.errors import InputError, RefusedError
 from companion.flight.course import Course
@@ -121,6 +121,7 @@ def simulated_world(flight: Flight) -> World:
 
 def loop_setpoint(setpoint: Setpoint) -> inner_loops.Setpoint:
     """A setpoint of the law as the vehicle's inner loops take it from the wire."""
+    assert not isinstance(setpoint, PositionSetpoint)  # not the law's
     level, zero = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     if isinstance(setpoint, AttitudeSetpoint):
         return inner_loops.Setpoint(inner_loops.ATTITUDE, setpoint.thrust, zero, setpoint.q, setpoint.yaw_rate, zero)

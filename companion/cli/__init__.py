@@ -25,6 +25,7 @@ COMMANDS = {
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
     "report": "Build report.html of a flight folder again.",
+    "replay": "Give a flight's states to the controller again and compare its commands.",
 }
 """Every command with its line in `companion --help`; the module companion.cli.NAME holds it."""
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.cli.common import JsonOption, TimeScaleOption, say
+from companion.cli.common import FrameOption, JsonOption, TimeScaleOption, say, trajectory_changes
 
 EXAMPLE = "Example: companion certify paper"
 
@@ -19,6 +19,7 @@ def run(
         str | None,
         typer.Option("--trajectory", metavar="NAME", help="Predict this trajectory instead of the flight's."),
     ] = None,
+    frame: FrameOption = None,
     start: Annotated[
         str | None, typer.Option("--start", metavar="N,E,D", help="Predict from here instead of the flight's [start].")
     ] = None,
@@ -34,7 +35,7 @@ def run(
     from companion.flight.tracker import kernels
     from companion.trajectory.load import of_flight
 
-    flight = _flight(config, trajectory, start, time_scale)
+    flight = _flight(config, trajectory_changes(trajectory, frame), start, time_scale)
     vehicle = flight.vehicle
     parameters = vehicle.parameters()
     certificate = certify(parameters.gains, parameters.model.drag)
@@ -86,7 +87,7 @@ def run(
         raise typer.Exit(int(ExitCode.REFUSED))
 
 
-def _flight(config: str, trajectory: str | None, start: str | None, time_scale: float | None) -> Any:
+def _flight(config: str, given: dict[str, Any], start: str | None, time_scale: float | None) -> Any:
     """The flight of a flight file; of a vehicle file one without a trajectory, unless one is given."""
     from pathlib import Path
 
@@ -98,11 +99,9 @@ def _flight(config: str, trajectory: str | None, start: str | None, time_scale: 
     path = find(config, "flights" if is_flight else "vehicles")
     data = read_toml(path)
     if "vehicle" in data:
-        if trajectory is not None:
-            data["trajectory"] = trajectory
-        flight = build_flight(data, str(path))
+        flight = build_flight({**data, **given}, str(path))
     else:
-        flight = build_flight({"name": path.stem, "vehicle": data, "trajectory": trajectory or ""}, str(path))
+        flight = build_flight({"name": path.stem, "vehicle": data, "trajectory": "", **given}, str(path))
     if start is not None:
         try:
             numbers = tuple(float(x) for x in start.split(","))

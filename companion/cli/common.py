@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from companion.errors import InputError
+
 if TYPE_CHECKING:
+    from companion.config import Flight
     from companion.flight.launch import Flown
+    from companion.frames import Frame
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="The flight's folder; default ./flights/<UTC>-<name>.")
+]
+WindOption = Annotated[
+    str | None,
+    typer.Option("--wind", metavar="N,E,D", help="Velocity of the air in m/s, where it moves to; acts by the drag."),
+]
+TurbulenceOption = Annotated[
+    float | None,
+    typer.Option("--turbulence", metavar="SHARE", help="Dryden gusts: standard deviation as a share of the mean wind."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 EngineOption = Annotated[
@@ -22,6 +34,26 @@ EngineOption = Annotated[
 ]
 VehicleOption = Annotated[
     str | None, typer.Option("--vehicle", metavar="NAME", help="Vehicle file, or the name of a bundled one.")
+]
+FaultsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--faults", metavar="FILE", help="What goes wrong with the bundled vehicle: a fault file, or a bundled name."
+    ),
+]
+ControllerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--controller", metavar="WHO", help='"law", or "px4": PX4\'s own position controller gets the reference.'
+    ),
+]
+FrameOption = Annotated[
+    str | None,
+    typer.Option("--frame", metavar="FRAME", help='Of the trajectory file: "enu", "nwu" (z up) or "ned".'),
+]
+TrajectoryOption = Annotated[
+    str | None,
+    typer.Option("--trajectory", metavar="FILE", help="Fly this instead: a trajectory file, or a bundled one's name."),
 ]
 TimeScaleOption = Annotated[
     float | None, typer.Option("--time-scale", metavar="X", help="Fly the trajectory X times as fast.")
@@ -69,6 +101,51 @@ class FlightDisplay:
             self._bar.update(self._task, completed=progress["t_s"], error=progress["error_m"])
 
 
+def fly_bundled(
+    flight: Flight,
+    folder: Path,
+    *,
+    px4: str,
+    engine: str,
+    lockstep: bool,
+    faults: Path | None,
+    timeout_s: float,
+    quiet: bool,
+) -> Flown:
+    """Starts the bundled vehicle, flies it, and ends it.
+
+    Raises:
+        InputError, LinkError: the vehicle does not start; it has said why.
+    """
+    from companion.flight.bundled import BundledVehicle
+    from companion.flight.launch import control
+
+    where = "on the ground" if flight.start is None else "in Hold"
+    with BundledVehicle(flight, folder, px4=px4, engine=engine, lockstep=lockstep, faults=faults) as bundled:
+        say(f"the bundled vehicle ({flight.vehicle.name}) waits {where}; flight folder {folder}", quiet=quiet)
+        with FlightDisplay(quiet=quiet) as display:
+
+            def listen(message: Mapping[str, Any]) -> None:
+                display(message)
+                if "flown" in message:  # it would wait for a companion that has gone
+                    bundled.stop()
+
+            return control(folder, bundled.connection, engine, timeout_s, listen)
+
+
+def fault_file(name: str | None) -> Path | None:
+    """The file of --faults.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name is None:
+        return None
+    from companion.config import find
+
+    return find(name, "faults")
+
+
 def report_flight(flown: Flown, *, as_json: bool) -> int:
     """Builds the report, prints what came out, and returns the exit code."""
     from companion.record.folder import SUMMARY_FILE, read_summary
@@ -94,17 +171,23 @@ def report_flight(flown: Flown, *, as_json: bool) -> int:
 def print_summary(summary: Mapping[str, Any]) -> None:
     """The figures that people look at first."""
     say(f"verdict: {summary['verdict']}")
+    by_law = summary.get("controller", "law") == "law"
     rows: list[tuple[str, str]] = [
+        ("controller", "the law" if by_law else "PX4's own position controller"),
         ("settled within 0.2 m at", _figure(summary["settled_at_s"], "s", 2)),
         ("statistics from", _figure(summary["statistics_from_s"], "s", 2)),
         ("position error rms", _figure(summary["position_rms_m"], "m", 4)),
         ("  95 % / largest", " / ".join(_figure(summary[k], "m", 4) for k in ("position_p95_m", "position_max_m"))),
+        ("  rms of the whole track", _figure(summary.get("track_rms_m"), "m", 4)),
         ("vertical error rms", _figure(summary["vertical_rms_m"], "m", 4)),
         ("heading error rms", _figure(summary["heading_rms_rad"], "rad", 4)),
-        ("disturbance (north, east, down)", _vector(summary["disturbance_m_s2"], "m/s^2")),
-        ("thrust", " to ".join(_figure(summary[k], "N", 1) for k in ("thrust_min_n", "thrust_max_n"))),
-        ("largest tilt", _figure(summary["tilt_max_rad"], "rad", 2)),
     ]
+    if by_law:
+        rows += [
+            ("disturbance (north, east, down)", _vector(summary["disturbance_m_s2"], "m/s^2")),
+            ("thrust", " to ".join(_figure(summary[k], "N", 1) for k in ("thrust_min_n", "thrust_max_n"))),
+        ]
+    rows.append(("largest tilt", _figure(summary["tilt_max_rad"], "rad", 2)))
     for name, value in rows:
         say(f"  {name:32s} {value}")
 
@@ -131,6 +214,74 @@ def adjustments(**changes: Any) -> Callable[[dict[str, Any]], None]:
             table[last] = value
 
     return adjust
+
+
+def controller_changes(controller: str | None, output: str | None) -> dict[str, Any]:
+    """--controller and --output as they go into [output].
+
+    Raises:
+        InputError: both, where they contradict each other.
+    """
+    if controller == "px4" and output is not None:
+        raise InputError(
+            f"--output {output} says what the law sends; with --controller px4 the reference itself is sent:"
+            " leave one out"
+        )
+    return {"output__controller": controller, "output__kind": output}
+
+
+def wind_changes(wind: str | None, turbulence: float | None) -> dict[str, Any]:
+    """--wind and --turbulence as they go into [world].
+
+    Raises:
+        InputError: --wind is not three numbers.
+    """
+    if wind is None:
+        return {"world__turbulence": turbulence}
+    try:
+        blows = tuple(float(x) for x in wind.split(","))
+    except ValueError:
+        blows = ()
+    if len(blows) != 3:
+        raise InputError(f"--wind {wind!r}: expected three numbers north,east,down in m/s, where the air moves to")
+    return {"world__wind_m_s": blows, "world__turbulence": turbulence}
+
+
+def trajectory_changes(trajectory: str | None, frame: str | None) -> dict[str, Any]:
+    """--trajectory and --frame as they go into a flight: the table that stands for the file.
+
+    Raises:
+        InputError: no such frame or file, or --frame without --trajectory.
+    """
+    if trajectory is None:
+        if frame is not None:
+            raise InputError(f"--frame {frame}: says the frame of the file that --trajectory names; add that")
+        return {}
+    from companion.trajectory.load import table_of
+
+    return {"trajectory": table_of(trajectory, frame_named(frame))}
+
+
+def frame_named(name: str | None) -> Frame | None:
+    """The frame of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    from companion.frames import FRAMES
+
+    if name is None:
+        return None
+    for frame in FRAMES:
+        if name == frame:
+            return frame
+    raise InputError(f"--frame {name!r}: allowed are " + ", ".join(f"{f} ({axes})" for f, axes in FRAMES.items()))
+
+
+def say_notes(notes: Sequence[str], *, quiet: bool) -> None:
+    """What people should know about where a trajectory comes from."""
+    for note in notes:
+        say(f"  {note}", quiet=quiet)
 
 
 def vehicle_changes(vehicle: str | None) -> dict[str, Any]:

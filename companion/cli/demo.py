@@ -3,22 +3,31 @@ this machine allows, and the same for the same seed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
 
 from companion.cli.common import (
+    ControllerOption,
     EngineOption,
-    FlightDisplay,
+    FaultsOption,
+    FrameOption,
     JsonOption,
     OutOption,
     TimeScaleOption,
+    TrajectoryOption,
+    TurbulenceOption,
     VehicleOption,
+    WindOption,
     adjustments,
+    controller_changes,
+    fault_file,
+    fly_bundled,
     report_flight,
-    say,
+    say_notes,
+    trajectory_changes,
     vehicle_changes,
+    wind_changes,
 )
 
 CONNECT_TIMEOUT_S = 15.0
@@ -27,14 +36,20 @@ EXAMPLE = "Example: companion demo --output attitude --out my-first-flight"
 
 def run(
     flight: Annotated[str, typer.Option("--flight", help="Flight file with [start] and [world].")] = "paper",
+    trajectory: TrajectoryOption = None,
+    frame: FrameOption = None,
     vehicle: VehicleOption = None,
     output: Annotated[str | None, typer.Option("--output", help='"rates", "attitude" or "actuators".')] = None,
+    controller: ControllerOption = None,
     px4: Annotated[str | None, typer.Option("--px4", help="1.13 or 1.18: which PX4 the vehicle behaves like.")] = None,
     state_age: Annotated[
         float | None, typer.Option("--state-age", metavar="S", help="Age of the vehicle's states when they arrive.")
     ] = None,
+    wind: WindOption = None,
+    turbulence: TurbulenceOption = None,
     time_scale: TimeScaleOption = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of noise and gusts.")] = None,
+    faults: FaultsOption = None,
     real_time: Annotated[bool, typer.Option("--real-time", help="Fly at real time instead of in lockstep.")] = False,
     out: OutOption = None,
     engine: EngineOption = "auto",
@@ -44,31 +59,35 @@ def run(
     from companion.accelerate import resolve
     from companion.config import load_flight
     from companion.errors import InputError
-    from companion.flight.bundled import PX4_VERSIONS, BundledVehicle, start_of
-    from companion.flight.launch import control, prepare
-    from companion.trajectory.load import embedded
+    from companion.flight.bundled import PX4_VERSIONS, start_of
+    from companion.flight.launch import prepare
+    from companion.trajectory.load import embedded, of_flight
 
     resolve(engine)
     if px4 is not None and px4 not in PX4_VERSIONS:
         raise InputError(f"--px4 {px4!r}: allowed are {', '.join(PX4_VERSIONS)}")
     changes: dict[str, Any] = {
         **vehicle_changes(vehicle),
-        "output__kind": output,
+        **trajectory_changes(trajectory, frame),
+        **controller_changes(controller, output),
+        **wind_changes(wind, turbulence),
         "vehicle__link__state_age_s": state_age,
         "world__seed": seed,
     }
     configured = embedded(load_flight(flight, adjustments(**changes)), time_scale)
     start_of(configured)
+    say_notes(of_flight(configured).notes, quiet=as_json)
+    faults_path = fault_file(faults)
     folder = prepare(configured, out)
-    version = px4 or ("1.13" if configured.output.kind == "actuators" else "1.18")
-    with BundledVehicle(configured, folder, px4=version, engine=engine, lockstep=not real_time) as bundled:
-        say(f"the bundled vehicle ({configured.vehicle.name}) waits in Hold; flight folder {folder}", quiet=as_json)
-        with FlightDisplay(quiet=as_json) as display:
-
-            def listen(message: Mapping[str, Any]) -> None:
-                display(message)
-                if "flown" in message:  # it would wait for a companion that has gone
-                    bundled.stop()
-
-            flown = control(folder, bundled.connection, engine, CONNECT_TIMEOUT_S, listen)
+    version = px4 or ("1.13" if configured.output.sends == "actuators" else "1.18")
+    flown = fly_bundled(
+        configured,
+        folder,
+        px4=version,
+        engine=engine,
+        lockstep=not real_time,
+        faults=faults_path,
+        timeout_s=CONNECT_TIMEOUT_S,
+        quiet=as_json,
+    )
     raise typer.Exit(report_flight(flown, as_json=as_json))

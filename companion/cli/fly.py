@@ -1,5 +1,5 @@
 """The vehicle must be there: this waits for its heartbeat, checks its gates, takes off if it stands on the ground, and
-flies.
+flies. With --sim it starts the bundled vehicle itself, in lockstep, on the ground or at the flight file's [start].
 
 Without --flight the vehicle file says everything: gains, limits, rates + thrust as output, Hold at the end.
 """
@@ -12,33 +12,51 @@ from typing import Annotated, Any
 import typer
 
 from companion.cli.common import (
+    ControllerOption,
     EngineOption,
+    FaultsOption,
     FlightDisplay,
+    FrameOption,
     JsonOption,
     OutOption,
     TimeScaleOption,
     VehicleOption,
     adjustments,
+    controller_changes,
+    fault_file,
+    fly_bundled,
     report_flight,
     say,
+    say_notes,
+    trajectory_changes,
     vehicle_changes,
 )
 
 EXAMPLE = "Example: companion fly circle --vehicle bundled --connect udpin:127.0.0.1:14540"
 
+CONNECTION = "udpin:127.0.0.1:14540"
+
 
 def run(
     trajectory: Annotated[str, typer.Argument(help="Trajectory file, or the name of a bundled one.")],
     connect: Annotated[
-        str, typer.Option("--connect", help="udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.")
-    ] = "udpin:127.0.0.1:14540",
+        str | None,
+        typer.Option(
+            "--connect",
+            help="udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; default udpin:127.0.0.1:14540.",
+        ),
+    ] = None,
+    sim: Annotated[bool, typer.Option("--sim", help="Start the bundled vehicle and fly that.")] = False,
+    faults: FaultsOption = None,
     vehicle: VehicleOption = None,
     flight: Annotated[
         str | None, typer.Option("--flight", metavar="NAME", help="Flight file with output, limits, acceptance.")
     ] = None,
     output: Annotated[str | None, typer.Option("--output", help='"rates", "attitude" or "actuators".')] = None,
+    controller: ControllerOption = None,
     land: Annotated[bool, typer.Option("--land", help="Land at the end instead of holding.")] = False,
     time_scale: TimeScaleOption = None,
+    frame: FrameOption = None,
     timeout: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for the vehicle.")] = 15.0,
     out: OutOption = None,
     engine: EngineOption = "auto",
@@ -50,23 +68,48 @@ def run(
     from companion.errors import InputError
     from companion.flight.launch import control, prepare
     from companion.link.transport import parse_connection
-    from companion.trajectory.load import embedded
+    from companion.trajectory.formats.reading import shown
+    from companion.trajectory.load import embedded, of_flight
 
     if flight is None and vehicle is None:
         raise InputError("say which vehicle this is: --vehicle NAME (a vehicle file), or --flight NAME (a flight file)")
     if not (isfinite(timeout) and timeout > 0.0):
         raise InputError(f"--timeout {timeout:g}: must be a number of seconds above 0")
+    if sim and connect is not None:
+        raise InputError(f"--sim starts the bundled vehicle, --connect {connect} names another: leave one out")
+    if faults is not None and not sim:
+        raise InputError(f"--faults {faults}: only for the bundled vehicle; add --sim")
     resolve(engine)
-    parse_connection(connect)
-    path = find(trajectory, "trajectories")
-    changes: dict[str, Any] = {"trajectory": trajectory, "output__kind": output, "after": "land" if land else None}
+    connection = connect or CONNECTION
+    parse_connection(connection)
+    faults_path = fault_file(faults)
+    name = shown(find(trajectory, "trajectories").stem)
+    changes: dict[str, Any] = {
+        **trajectory_changes(trajectory, frame),
+        "after": "land" if land else None,
+        **controller_changes(controller, output),
+    }
     if flight is None:
-        base = {"name": path.stem, "vehicle": vehicle, "trajectory": trajectory}
+        base = {"name": name, "vehicle": vehicle, "trajectory": trajectory}
         configured = build_flight(base, "command line", adjustments(**changes))
     else:
         configured = load_flight(flight, adjustments(**changes, **vehicle_changes(vehicle)))
-    folder = prepare(embedded(configured, time_scale), out)
-    say(f"{configured.name}: {path.stem} on {configured.vehicle.name}, listening on {connect}", quiet=as_json)
+    complete = embedded(configured, time_scale)
+    say_notes(of_flight(complete).notes, quiet=as_json)
+    folder = prepare(complete, out)
+    if sim:
+        flown = fly_bundled(
+            complete,
+            folder,
+            px4="1.13" if complete.output.sends == "actuators" else "1.18",
+            engine=engine,
+            lockstep=True,
+            faults=faults_path,
+            timeout_s=timeout,
+            quiet=as_json,
+        )
+        raise typer.Exit(report_flight(flown, as_json=as_json))
+    say(f"{configured.name}: {name} on {configured.vehicle.name}, listening on {connection}", quiet=as_json)
     with FlightDisplay(quiet=as_json) as display:
-        flown = control(folder, connect, engine, timeout, display)
+        flown = control(folder, connection, engine, timeout, display)
     raise typer.Exit(report_flight(flown, as_json=as_json))

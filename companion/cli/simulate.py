@@ -10,11 +10,15 @@ import typer
 
 from companion.cli.common import (
     EngineOption,
+    FrameOption,
     JsonOption,
     TimeScaleOption,
+    TrajectoryOption,
     adjustments,
     print_summary,
     say,
+    say_notes,
+    trajectory_changes,
     vehicle_changes,
 )
 
@@ -28,6 +32,8 @@ def run(
     ] = False,
     csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per control step.")] = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", help="Another vehicle file for this flight.")] = None,
+    trajectory: TrajectoryOption = None,
+    frame: FrameOption = None,
     time_scale: TimeScaleOption = None,
     allow_uncertified: Annotated[
         bool, typer.Option("--allow-uncertified", help="Try gains that no flight would be allowed with.")
@@ -41,14 +47,22 @@ def run(
 
     from companion.campaign.simulate import fly_ideal, fly_sampled, write_csv
     from companion.config import load_flight
+    from companion.errors import InputError
     from companion.flight.preflight import gate_gains, gate_reference
     from companion.flight.tracker import kernels
     from companion.trajectory.load import embedded, of_flight
 
-    configured = embedded(load_flight(flight, adjustments(**vehicle_changes(vehicle))), time_scale)
-    trajectory = of_flight(configured)
+    changes = {**vehicle_changes(vehicle), **trajectory_changes(trajectory, frame)}
+    configured = embedded(load_flight(flight, adjustments(**changes)), time_scale)
+    if configured.output.controller != "law":
+        raise InputError(
+            f"flight {configured.name!r} is PX4's own controller's (output.controller); simulate computes the law"
+            " alone: fly it with `companion demo`"
+        )
+    path = of_flight(configured)
+    say_notes(path.notes, quiet=as_json)
     gate_gains(configured.vehicle, allow_uncertified=allow_uncertified)
-    gate_reference(trajectory, configured.vehicle)
+    gate_reference(path, configured.vehicle)
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("simulating", total=1.0)
 
@@ -56,16 +70,16 @@ def run(
             bar.update(task, completed=share)
 
         if ideal:
-            trace = fly_ideal(configured, trajectory, progress)
+            trace = fly_ideal(configured, path, progress)
         else:
-            trace = fly_sampled(configured, trajectory, kernels(engine), progress)
+            trace = fly_sampled(configured, path, kernels(engine), progress)
     if csv is not None:
         write_csv(trace, csv)
     if as_json:
         print(json.dumps(trace.summary, indent=2))
         return
     setting = "the paper's ideal setting" if ideal else "sampled, with the vehicle file's lags, delay and noise"
-    say(f"{configured.name}: {trajectory.name} on {configured.vehicle.name}, {setting}")
+    say(f"{configured.name}: {path.name} on {configured.vehicle.name}, {setting}")
     print_summary(trace.summary)
     truth = ", ".join(f"{x:.3f}" for x in trace.truth_disturbance_m_s2)
     say(f"  {'true disturbance':32s} ({truth}) m/s^2")

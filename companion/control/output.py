@@ -44,7 +44,32 @@ class ActuatorSetpoint(NamedTuple):
     """About body x, y, z, -1 to 1."""
 
 
-Setpoint = RateSetpoint | AttitudeSetpoint | ActuatorSetpoint
+class PositionSetpoint(NamedTuple):
+    """A point of a trajectory for the autopilot's own position controller: SET_POSITION_TARGET_LOCAL_NED, local NED.
+
+    What is None is not commanded: its ignore bits are set.
+    """
+
+    p: Vec3 | None
+    """Position [m]."""
+    v: Vec3
+    """Velocity [m/s]; feed-forward where a position is commanded too."""
+    a: Vec3 | None
+    """Acceleration [m/s^2], feed-forward."""
+    yaw: float | None
+    """Heading [rad], -pi to pi; None: PX4 holds the one that it has."""
+    yaw_rate: float | None
+    """Feed-forward about the vertical, positive clockwise from above [rad/s]."""
+
+
+LawSetpoint = RateSetpoint | AttitudeSetpoint | ActuatorSetpoint
+"""What the law sends."""
+Setpoint = LawSetpoint | PositionSetpoint
+
+
+def thrust_of(setpoint: Setpoint) -> float:
+    """The thrust that a setpoint commands, 0 to 1; NaN where that is the autopilot's own business."""
+    return math.nan if isinstance(setpoint, PositionSetpoint) else setpoint.thrust
 
 
 class Conversion(NamedTuple):

@@ -18,6 +18,7 @@ from companion.errors import ExitCode, InputError, LinkError
 
 TRUTH_FILE = "truth.csv"
 VEHICLE_FILE = "vehicle.toml"
+FAULTS_FILE = "faults.toml"
 PX4_VERSIONS = ("1.13", "1.18")
 """Which PX4 the vehicle can behave like."""
 
@@ -41,7 +42,7 @@ def start_of(flight: Flight) -> Start:
 
 
 class BundledVehicle:
-    """The simulated vehicle of a flight, waiting in Hold at its [start]; a context manager.
+    """The simulated vehicle of a flight, waiting in Hold at its [start], or on the ground; a context manager.
 
     Args:
         flight: gives the vehicle, [start] and [world].
@@ -49,14 +50,16 @@ class BundledVehicle:
         px4: "1.13" or "1.18".
         engine: of the physics.
         lockstep: the vehicle's clock waits for the companion; else real time.
+        faults: file with what goes wrong; a copy goes into the folder.
 
     Raises:
-        InputError: the flight has no [start].
         InputError, LinkError: on entering, when the vehicle does not start; it has said why on stderr.
     """
 
-    def __init__(self, flight: Flight, folder: Path, *, px4: str, engine: str, lockstep: bool) -> None:
-        start = start_of(flight)
+    def __init__(
+        self, flight: Flight, folder: Path, *, px4: str, engine: str, lockstep: bool, faults: Path | None = None
+    ) -> None:
+        start = flight.start
         self._port = free_udp_port()
         self.connection = f"udpin:127.0.0.1:{self._port}"
         """Where the companion listens for it."""
@@ -64,13 +67,16 @@ class BundledVehicle:
         vehicle_file.write_text(tomlkit.dumps(_plain(flight.vehicle.model_dump(exclude_none=True))), encoding="utf-8")
         self._command = [
             *(sys.executable, "-m", "sim_link", "run", "--vehicle", str(vehicle_file)),
-            *(f"--start={_joined(*start.position_m, start.yaw_deg)}", "--px4", px4, "--engine", engine),
+            *((f"--start={_joined(*start.position_m, start.yaw_deg)}",) if start is not None else ()),
+            *("--px4", px4, "--engine", engine, *(("--faults", str(faults)) if faults is not None else ())),
             *(f"--force={_joined(*flight.world.force_n)}", f"--wind={_joined(*flight.world.wind_m_s)}"),
             *(f"--gravity-factor={flight.world.gravity_factor!r}", f"--turbulence={flight.world.turbulence!r}"),
             *("--seed", str(flight.world.seed), "--truth", str(folder / TRUTH_FILE)),
             *("--port", "0", "--remote-port", str(self._port), "--no-ground", "--no-truth-stream"),
             *("--json-ready", "--with-parent", *(("--lockstep",) if lockstep else ())),
         ]
+        if faults is not None:
+            (folder / FAULTS_FILE).write_bytes(faults.read_bytes())
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> BundledVehicle:

@@ -82,6 +82,7 @@ class Course:
     def __init__(
         self, trajectory: Trajectory, vehicle: Vehicle, hold_point: Vec3, yaw_rad: float, home: Vec3 | None
     ) -> None:
+        self.hold_point, self.yaw_rad, self.home = hold_point, yaw_rad, home
         limits, model = reference_limits(vehicle), point_mass(vehicle)
         path: Anchored = anchored(trajectory, hold_point, home)
         pieces: list[Piece] = []

@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 
 from companion.config import Flight, FlightLimits
-from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, RateSetpoint, Setpoint, thrust_fraction
+from companion.control.output import (
+    ActuatorSetpoint,
+    AttitudeSetpoint,
+    PositionSetpoint,
+    RateSetpoint,
+    Setpoint,
+    thrust_fraction,
+)
 from companion.control.types import GRAVITY_M_S2, Quat, Vec3
 from companion.control.vectors import axes
 from companion.flight.phases import Cause
@@ -53,10 +60,15 @@ class Guards:
 def coast_setpoint(flight: Flight, q: Quat) -> Setpoint:
     """No rotation, and hover thrust over the cosine of the tilt, clipped: what keeps height and attitude for a moment.
 
+    Where PX4's own position controller follows the setpoints it is to stop: it has a state when we have none, but would
+    fly on with the last velocity as feed-forward.
+
     Args:
         flight: gives weight, limits and the kind of output.
         q: the last known attitude.
     """
+    if flight.output.sends == "position":
+        return PositionSetpoint(None, (0.0, 0.0, 0.0), None, None, None)
     vehicle, limits = flight.vehicle, flight.vehicle.limits
     cosine = max(axes(q)[2][2], COSINE_MIN)
     thrust_n = min(max(vehicle.body.mass_kg * GRAVITY_M_S2 / cosine, limits.thrust_min_n), limits.thrust_max_n)

@@ -19,10 +19,10 @@ from typing import Any
 from companion.campaign.predict import gate_prediction
 from companion.config import Flight
 from companion.errors import CompanionError, ExitCode
-from companion.flight.preflight import gate_gains, gate_reference
+from companion.flight.preflight import gate_gains, gate_place, gate_reference
 from companion.flight.tracker import kernels
 from companion.record.folder import create_flight_folder, write_configuration
-from companion.trajectory.load import of_flight
+from companion.trajectory.load import of_flight, stored
 
 Listener = Callable[[Mapping[str, Any]], None]
 
@@ -44,11 +44,15 @@ def prepare(flight: Flight, out: Path | None) -> Path:
         CompanionError: a gate refuses, or the folder cannot be written; nothing has connected yet.
     """
     trajectory = of_flight(flight)
-    gate_gains(flight.vehicle)
+    by_law = flight.output.controller == "law"  # the gains, and what is predicted with them, are the law's
+    if by_law:
+        gate_gains(flight.vehicle)
     gate_reference(trajectory, flight.vehicle)
-    gate_prediction(flight, trajectory, kernels("python"))
+    gate_place(trajectory, flight.height_min_m)
+    if by_law:
+        gate_prediction(flight, trajectory, kernels("python"))
     folder = create_flight_folder(flight.name, out)
-    write_configuration(folder, flight.model_dump(exclude_none=True))
+    write_configuration(folder, stored(flight, folder).model_dump(exclude_none=True))
     return folder
 
 

@@ -22,14 +22,15 @@ from companion.control.types import State
 from companion.errors import LinkError
 from companion.flight.clock import VehicleClock
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
+from companion.flight.controller import controller_of
 from companion.flight.course import Course, at_rest
 from companion.flight.guards import Guards, coast_setpoint
 from companion.flight.last_resort import ask_for_hold
-from companion.flight.phases import Autopilot, Cause, FlightEnded, Outcome, Phase
+from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Outcome, Phase
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
-from companion.flight.tracker import Kernels, Tracker, TrackerStep
+from companion.flight.tracker import Kernels, TrackerStep
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
@@ -128,7 +129,7 @@ class FlightLoop:
         self._progress = progress
         self._connect_timeout_s = connect_timeout_s
         self._connection = connection
-        self._tracker = Tracker(flight.vehicle, flight.output.kind, compiled)
+        self._tracker = controller_of(flight, compiled)
         self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
         self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
         self._silence_s = max(SILENT_PERIODS * self._interval_s, SILENCE_MIN_S)
@@ -150,6 +151,7 @@ class FlightLoop:
         """Stamp of the last state that a setpoint went out for."""
         self._coasted = False
         self._unaccounted: _Step | None = None
+        self._engagement: Engagement | None = None
         self._sent_ns = 0
         self._guards = Guards(flight.vehicle.limits)
         self._heartbeat_s = -math.inf
@@ -185,7 +187,8 @@ class FlightLoop:
         if not self._met:
             return Outcome(cause, detail, [], 0, {}, fault)
         rejected = {reason.name: n for reason, n in self._telemetry.rejected.items() if n}
-        return Outcome(cause, detail, self._sequence.changes, self._lost, rejected, fault)
+        read = dict(self._autopilot.parameters)
+        return Outcome(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement)
 
     def _fly(self) -> tuple[Cause, str]:
         try:
@@ -320,7 +323,7 @@ class FlightLoop:
         message = codec.decode_timesync(frame.payload)
         if not timesync.is_request(message, self._wire.system_id, self._wire.component_id):
             return
-        self._peer.on_request()
+        self._peer.on_request(message.ts1)
         self._clock.on_timesync(message.ts1, frame.arrival_wall_ns)
         self._requests.append((message, frame))
         if self._peer.paced:
@@ -415,6 +418,10 @@ class FlightLoop:
         """OFFBOARD is confirmed: the controller starts from the hover."""
         thrust_n = hover_thrust_n(self._autopilot, self._flight.vehicle, state.q)
         self._tracker.begin(State(state.p, state.v, state.q, state.w), thrust_n)
+        course = self._sequence.course
+        assert course is not None
+        begin_s = self._sequence.engaged_at_s
+        self._engagement = Engagement(begin_s, course.hold_point, course.yaw_rad, course.home, state.q, thrust_n)
 
     def _track(self, state: VehicleState, skipped: int, arrival_ns: int) -> None:
         sequence = self._sequence

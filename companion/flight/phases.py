@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from companion.control.types import Vec3
+from companion.control.types import Quat, Vec3
 from companion.errors import ExitCode
+from companion.frames import GeoPoint
 from companion.link.modes import Mode
 from companion.record.summary import PhaseChange
 
@@ -50,7 +52,7 @@ class Cause(Enum):
     ESTIMATE_JUMPED = Ending("the autopilot's position estimate was reset", ExitCode.LOST)
     POSITION_ERROR = Ending("the position error left its limit", ExitCode.LOST)
     TILT = Ending("the tilt left its limit", ExitCode.LOST)
-    UNSENDABLE = Ending("the law gave a setpoint that must not be sent", ExitCode.INTERNAL)
+    UNSENDABLE = Ending("the controller gave a setpoint that must not be sent", ExitCode.INTERNAL)
     FAULT = Ending("a fault of the program", ExitCode.INTERNAL)
 
 
@@ -85,11 +87,54 @@ class Autopilot:
     landed: LandedState = LandedState.UNDEFINED
     home: Vec3 | None = None
     """Home position in the local frame, NED [m]."""
+    home_global: GeoPoint | None = None
+    """The same on the Earth, altitude above mean sea level; None while the vehicle has no global position."""
     home_amsl_m: float | None = None
     """Its altitude above mean sea level [m]."""
     hold_thrust: float | None = None
     """Thrust setpoint while the autopilot itself held the vehicle, smoothed (0 to 1)."""
     parameters: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Engagement:
+    """How the controller took over: with this and the recorded states its commands can be computed again."""
+
+    at_s: float
+    """Vehicle time at which the course began [s]."""
+    hold_point_m: Vec3
+    """Where the vehicle was held, NED: the course was planned from there."""
+    yaw_rad: float
+    """The heading there."""
+    home_m: Vec3 | None
+    """The home position, NED, if it was known."""
+    attitude: Quat
+    """Body to NED, at that moment."""
+    thrust_n: float | None
+    """The thrust that held the vehicle; None: the weight was taken."""
+
+    @classmethod
+    def from_numbers(cls, entry: Mapping[str, Any]) -> Engagement:
+        """Reads what `dataclasses.asdict` gave, as JSON keeps it. Raises KeyError, TypeError or ValueError."""
+        home, thrust = entry["home_m"], entry["thrust_n"]
+        return cls(
+            float(entry["at_s"]),
+            _vector(entry["hold_point_m"]),
+            float(entry["yaw_rad"]),
+            None if home is None else _vector(home),
+            _quaternion(entry["attitude"]),
+            None if thrust is None else float(thrust),
+        )
+
+
+def _vector(numbers: Sequence[float]) -> Vec3:
+    north, east, down = numbers
+    return float(north), float(east), float(down)
+
+
+def _quaternion(numbers: Sequence[float]) -> Quat:
+    w, x, y, z = numbers
+    return float(w), float(x), float(y), float(z)
 
 
 @dataclass
@@ -103,6 +148,10 @@ class Outcome:
     rejected_states: dict[str, int]
     fault: str = ""
     """The traceback, when the program itself failed."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """The autopilot's parameters that were read."""
+    engagement: Engagement | None = None
+    """None: the controller never took over."""
 
     @property
     def sentence(self) -> str:

@@ -7,17 +7,18 @@ needs, and measures the state rate.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from companion.config import Flight, Vehicle
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.sampled import Margins, Timing, margins
 from companion.errors import RefusedError
-from companion.flight.course import point_mass, reference_limits
+from companion.flight.inspection import Problem, place_problems, reference_problems
 from companion.flight.phases import Autopilot, Cause, FlightEnded
 from companion.link import codec
 from companion.link.operations import Operation, Operations
 from companion.link.telemetry import VehicleState
 from companion.trajectory.anchored import Trajectory, anchored
-from companion.trajectory.feasibility import check
 
 DELAY_MARGIN_MIN_S = 0.010
 RATE_FLOOR = 0.8
@@ -31,6 +32,13 @@ FIRST_STATE_TIMEOUT_S = 5.0
 PARAMETERS = ("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE", "THR_MDL_FAC")
 NEEDED = ("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE")
 """What the gates and the loop's own silence go by."""
+BASELINE_PARAMETERS = (
+    *("MPC_XY_P", "MPC_Z_P", "MPC_XY_VEL_P_ACC", "MPC_XY_VEL_I_ACC", "MPC_XY_VEL_D_ACC"),
+    *("MPC_Z_VEL_P_ACC", "MPC_Z_VEL_I_ACC", "MPC_Z_VEL_D_ACC", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP"),
+    *("MPC_Z_VEL_MAX_DN", "MPC_TILTMAX_AIR", "MPC_THR_HOVER"),
+)
+"""Beside those, where PX4's own position controller flies: what its tracking goes by. For the summary; none is a
+must."""
 
 _STICK_ACTIONS = (0.0, 1.0, 2.0)
 """COM_OBL_RC_ACT: Position, Altitude, Stabilized; without sticks NAV_RCL_ACT acts instead."""
@@ -97,11 +105,26 @@ def gate_reference(trajectory: Trajectory, vehicle: Vehicle) -> None:
     Raises:
         RefusedError: with the first violation.
     """
-    path = anchored(trajectory, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    violations = check(path, reference_limits(vehicle), point_mass(vehicle))
-    if violations:
-        more = f" (and {len(violations) - 1} more)" if len(violations) > 1 else ""
-        raise RefusedError(f"trajectory {trajectory.name!r}: {violations[0].sentence}{more}")
+    _refuse(trajectory, reference_problems(trajectory, vehicle))
+
+
+def gate_place(trajectory: Trajectory, height_min_m: float) -> None:
+    """The trajectory stays above the ground and within the fence that came with it, where its anchor says where it is.
+
+    One that begins wherever the vehicle holds is looked at there (`inspection.gate_ground`).
+
+    Raises:
+        RefusedError: with the first figure that fails.
+    """
+    if trajectory.anchor != "here":
+        path = anchored(trajectory, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        _refuse(trajectory, place_problems(path, None, height_min_m)[2])
+
+
+def _refuse(trajectory: Trajectory, problems: Sequence[Problem]) -> None:
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise RefusedError(f"trajectory {trajectory.name!r}: {problems[0].sentence}{more}")
 
 
 class Preflight:
@@ -172,7 +195,8 @@ class Preflight:
             self._pending.append(ops.set_message_interval(msgid, int(1e6 / hz), now_s))
         for msgid in (codec.AUTOPILOT_VERSION, HOME_POSITION):
             self._pending.append(ops.request_message(msgid, now_s))
-        for name in PARAMETERS:
+        law = self._flight.output.controller == "law"
+        for name in PARAMETERS if law else (*PARAMETERS, *BASELINE_PARAMETERS):
             self._reads[name] = ops.read_parameter(name, now_s)
             self._pending.append(self._reads[name])
 
@@ -186,7 +210,8 @@ class Preflight:
         for name in NEEDED:
             if name not in self._autopilot.parameters:
                 raise FlightEnded(Cause.REFUSED, f"{self._reads[name].sentence}; the flight must know it")
-        if self._autopilot.parameters.get("MAV_TYPE") == 0.0 and self._flight.output.kind != "actuators":
+        sends = self._flight.output.sends
+        if self._autopilot.parameters.get("MAV_TYPE") == 0.0 and sends in {"rates", "attitude"}:
             raise FlightEnded(
                 Cause.REFUSED,
                 "parameter MAV_TYPE is 0 (generic): PX4 then takes the thrust of SET_ATTITUDE_TARGET as zero; set it to"
@@ -194,7 +219,7 @@ class Preflight:
             )
         self._gate_failsafe()
         version = self._ops.version
-        if self._flight.output.kind == "actuators" and (version is None or not version.accepts_actuator_control):
+        if sends == "actuators" and (version is None or not version.accepts_actuator_control):
             label = "an unknown version" if version is None else f"version {version.label}"
             raise FlightEnded(
                 Cause.REFUSED,

@@ -13,15 +13,17 @@ import signal
 import socket
 import sys
 import traceback
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from companion.config import build_flight, read_toml
 from companion.errors import CompanionError, ExitCode
+from companion.flight.controller import controller_of
 from companion.flight.loop import FlightLoop, Progress
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
-from companion.flight.preflight import gate_gains
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.preflight import BASELINE_PARAMETERS, gate_gains
+from companion.flight.tracker import kernels
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, write_summary
@@ -77,10 +79,13 @@ def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: St
     path = folder / CONFIGURATION_FILE
     flight = build_flight(read_toml(path), str(path))
     trajectory = of_flight(flight)
-    gate_gains(flight.vehicle)
     compiled = kernels(engine)
+    if flight.output.controller == "law":
+        gate_gains(flight.vehicle)
+        status.line(f"engine: {compiled.engine}")
+    else:
+        status.line("controller: PX4's own, it gets the reference as setpoints")
     warm_up(flight, compiled)
-    status.line(f"engine: {compiled.engine}")
     capacity = int((trajectory.duration_s + MARGIN_S) * flight.vehicle.link.state_rate_hz * 1.1)
     record = FlightRecord(capacity, PHASE_NAMES)
     recorder = Recorder.start(folder)
@@ -109,7 +114,7 @@ def warm_up(flight: Any, compiled: Any) -> None:
     from companion.control.types import State
     from companion.flight.course import at_rest
 
-    tracker = Tracker(flight.vehicle, flight.output.kind, compiled)
+    tracker = controller_of(flight, compiled)
     zero = (0.0, 0.0, 0.0)
     state = State(zero, zero, (1.0, 0.0, 0.0, 0.0), zero)
     tracker.begin(state)
@@ -126,10 +131,16 @@ def _finish(folder: Path, flight: Any, trajectory: Any, record: FlightRecord, ou
             outcome.lost_setpoints,
             flight.statistics_from_s,
             flight.acceptance.thresholds(),
+            flight.output.controller,
         )
         summary = summarise(record, outcome.phases, meta)
         summary["ended"] = outcome.sentence
+        if outcome.engagement is not None:
+            summary["engagement"] = asdict(outcome.engagement)
         summary["rejected_states"] = outcome.rejected_states
+        if flight.output.controller == "px4":
+            read = outcome.parameters
+            summary["px4_parameters"] = {name: read[name] for name in BASELINE_PARAMETERS if name in read}
         if outcome.cause is not Cause.COMPLETED:
             summary["verdict"] = f"ended early: {outcome.sentence}"
         elif summary["verdict"] != "passed":

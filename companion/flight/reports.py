@@ -10,6 +10,7 @@ from companion.control.types import GRAVITY_M_S2, Quat
 from companion.control.vectors import axes
 from companion.flight.phases import Autopilot, LandedState
 from companion.flight.preflight import ATTITUDE_TARGET, CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION
+from companion.frames import GeoPoint
 from companion.link import codec
 from companion.link.framing import Frame
 from companion.link.modes import HOLD, Mode
@@ -50,6 +51,14 @@ def take_report(autopilot: Autopilot, frame: Frame) -> None:
     elif all(math.isfinite(x) for x in (message.x, message.y, message.z)):
         autopilot.home = (message.x, message.y, message.z)
         autopilot.home_amsl_m = message.altitude * 1e-3
+        autopilot.home_global = _place(message)
+
+
+def _place(message: Any) -> GeoPoint | None:
+    """The home position on the Earth; zero for both angles is what a vehicle without a global position sends."""
+    if (message.latitude, message.longitude) == (0, 0):
+        return None
+    return GeoPoint(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
 
 
 def hover_thrust_n(autopilot: Autopilot, vehicle: Vehicle, q: Quat) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from companion.control import flat
+from companion.control.output import thrust_of
 from companion.control.types import Reference, Vec3
 from companion.flight.phases import PHASE_INDEX, Phase
 from companion.flight.tracker import TrackerStep
@@ -45,6 +46,6 @@ def control_row(
         (state.t_vehicle_us * 1e-6, track_s, PHASE_INDEX[phase], *state.p, *state.v, *state.q, *state.w)
         + (*reference.p, *reference.v, *error, n[flat.HEADING_ERROR], *n[flat.ERRORS], n[flat.LYAPUNOV])
         + (*n[flat.B_HAT], n[flat.TOTAL], n[flat.TOTAL_RATE], *n[flat.TAU], *n[flat.RATES])
-        + (out.setpoint.thrust, timing.age_ms, timing.took_us, float(timing.late), float(timing.skipped))
+        + (thrust_of(out.setpoint), timing.age_ms, timing.took_us, float(timing.late), float(timing.skipped))
         + (n[flat.LIMITS],)
     )

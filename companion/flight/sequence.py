@@ -14,6 +14,7 @@ from companion.config import Flight
 from companion.control.types import Vec3
 from companion.errors import RefusedError
 from companion.flight.course import Course
+from companion.flight.inspection import gate_ground
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Phase
 from companion.flight.preflight import Preflight
 from companion.frames import yaw_from_quat
@@ -23,6 +24,7 @@ from companion.link.operations import Operation, Operations, Retry
 from companion.link.telemetry import VehicleState
 from companion.record.summary import PhaseChange
 from companion.trajectory.anchored import Trajectory
+from companion.trajectory.earth import home_for
 
 STREAM_BEFORE_OFFBOARD_S = 1.0
 """Hold setpoints go out for this long before OFFBOARD is asked for; PX4 needs one, older versions more."""
@@ -259,8 +261,13 @@ class Sequence:
         hold: Vec3 = state.p
         try:
             self.course = Course(
-                self._trajectory, self._flight.vehicle, hold, yaw_from_quat(state.q), self._autopilot.home
+                self._trajectory,
+                self._flight.vehicle,
+                hold,
+                yaw_from_quat(state.q),
+                home_for(self._trajectory, self._autopilot.home, self._autopilot.home_global),
             )
+            gate_ground(self.course.path, self._autopilot.home, self._flight.height_min_m)
         except RefusedError as error:
             raise FlightEnded(Cause.REFUSED, str(error)) from None
         self._operation = None
@@ -281,7 +288,7 @@ class Sequence:
             self.engaged_at_s = self._state.t_vehicle_us * 1e-6
             self._engage(self._state)
             if self.course.join_s == 0.0:
-                self.enter(Phase.TRACK, self.engaged_at_s, "OFFBOARD confirmed; the law itself joins the trajectory")
+                self.enter(Phase.TRACK, self.engaged_at_s, "OFFBOARD confirmed; the controller joins the trajectory")
             else:
                 self._notify(f"join: OFFBOARD confirmed, {self.course.join_s:.1f} s to the start of the trajectory")
         elif now_s - self._since_s > STREAM_BEFORE_OFFBOARD_S + OFFBOARD_TIMEOUT_S:

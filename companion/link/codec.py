@@ -25,6 +25,7 @@ ATTITUDE_QUATERNION: Final = 31
 COMMAND_LONG: Final = 76
 COMMAND_ACK: Final = 77
 SET_ATTITUDE_TARGET: Final = 82
+SET_POSITION_TARGET_LOCAL_NED: Final = 84
 TIMESYNC: Final = 111
 SET_ACTUATOR_CONTROL_TARGET: Final = 139
 AUTOPILOT_VERSION: Final = 148
@@ -36,6 +37,7 @@ MAV_TYPE_ONBOARD_CONTROLLER: Final = 18
 MAV_AUTOPILOT_PX4: Final = 12
 MAV_AUTOPILOT_INVALID: Final = 8
 MAV_STATE_ACTIVE: Final = 4
+MAV_FRAME_LOCAL_NED: Final = 1
 MAV_MODE_FLAG_SAFETY_ARMED: Final = 128
 
 _HEARTBEAT = struct.Struct("<IBBBBB")
@@ -45,6 +47,7 @@ _TIMESYNC = struct.Struct("<qqBB")
 _ATTITUDE_QUATERNION = struct.Struct("<I7f16x")
 _ODOMETRY = struct.Struct("<Q13f168x4Bb")  # 168: two covariances of 21 floats
 _SET_ATTITUDE_TARGET = struct.Struct("<I4f3ffBBB")
+_SET_POSITION_TARGET_LOCAL_NED = struct.Struct("<I11fHBBB")
 _SET_ACTUATOR_CONTROL_TARGET = struct.Struct("<Q8fBBB")
 _PARAM_REQUEST_READ = struct.Struct("<hBB16s")
 _PARAM_VALUE = struct.Struct("<4sHH16sB")
@@ -307,6 +310,30 @@ def encode_set_attitude_target(
     """SET_ATTITUDE_TARGET (82): attitude, body rates [rad/s], collective thrust 0..1; mask bits say what to ignore."""
     return _SET_ATTITUDE_TARGET.pack(
         time_boot_ms, q[0], q[1], q[2], q[3], w[0], w[1], w[2], thrust, target_system, target_component, type_mask
+    )
+
+
+def encode_set_position_target_local_ned(
+    time_boot_ms: int,
+    target_system: int,
+    target_component: int,
+    type_mask: int,
+    vectors: tuple[Vec3, Vec3, Vec3],
+    yaw: tuple[float, float],
+) -> bytes:
+    """SET_POSITION_TARGET_LOCAL_NED (84) in MAV_FRAME_LOCAL_NED; mask bits say what to ignore.
+
+    Args:
+        time_boot_ms: the vehicle's time.
+        target_system: the autopilot's.
+        target_component: the autopilot's.
+        type_mask: POSITION_TARGET_TYPEMASK.
+        vectors: position [m], velocity [m/s] and acceleration [m/s^2], NED.
+        yaw: heading [rad] and its rate [rad/s].
+    """
+    p, v, a = vectors
+    return _SET_POSITION_TARGET_LOCAL_NED.pack(
+        time_boot_ms, *p, *v, *a, *yaw, type_mask, target_system, target_component, MAV_FRAME_LOCAL_NED
     )
 
 

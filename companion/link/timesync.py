@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 from companion.link.codec import Timesync, encode_timesync
 
 PACED_STATES: Final = 10
-"""States in a row that must have been followed by a request."""
+"""Requests in a row that must have come, one after each state."""
 PACED_INTERVAL_MAX_US: Final = 50_000
-"""States further apart do not count: PX4's own 10 Hz of requests would look like lockstep at a low state rate."""
+"""Requests further apart in the vehicle's time do not count: PX4's own come at 10 Hz."""
 
 
 def is_request(message: Timesync, own_system: int, own_component: int) -> bool:
@@ -65,31 +65,36 @@ def clock_offset(response: Timesync, received_ns: int) -> ClockOffset:
 
 
 class PacedPeer:
-    """Notices a vehicle in lockstep: each of the last states was followed by a TIMESYNC request before the next state.
+    """Notices a vehicle in lockstep: it asks for our time after every state, far more often than PX4 does.
 
-    Such a vehicle's clock stands still while we compute, so limits on silence in wall time may be generous. Once
-    paced, one state without its request ends it.
+    Such a vehicle's clock stands still while we compute, so limits on silence in wall time may be generous. The
+    requests alone are counted: their states may be lost, late or bunched on the way, the exchange that moves the clock
+    is not. Once paced, a state from beyond the last request, or a gap between two requests, ends it.
     """
 
     def __init__(self, states: int = PACED_STATES) -> None:
         self._needed = states
         self._streak = 0
-        self._followed = False
-        self._last_us: int | None = None
+        self._states = 0
+        self._asked_us: int | None = None
         self.paced = False
         """Whether the vehicle waits for our answers."""
 
     def on_state(self, t_vehicle_us: int) -> None:
         """A new state came, with its own stamp."""
-        last_us = self._last_us
-        self._last_us = t_vehicle_us
-        if last_us is None:
-            return
-        close = self.paced or 0 <= t_vehicle_us - last_us <= PACED_INTERVAL_MAX_US
-        self._streak = self._streak + 1 if self._followed and close else 0
-        self._followed = False
-        self.paced = self._streak >= self._needed
+        self._states += 1
+        if self._asked_us is not None and t_vehicle_us - self._asked_us > PACED_INTERVAL_MAX_US:
+            self._begin_anew()
 
-    def on_request(self) -> None:
-        """A TIMESYNC request came from the vehicle."""
-        self._followed = self._last_us is not None
+    def on_request(self, ts1_ns: int) -> None:
+        """A TIMESYNC request came from the vehicle, whose clock was `ts1_ns`."""
+        asked_us = ts1_ns // 1000
+        last_us, self._asked_us = self._asked_us, asked_us
+        if last_us is not None and not 0 < asked_us - last_us <= PACED_INTERVAL_MAX_US:
+            self._begin_anew()
+        self._streak += 1
+        self.paced = self._states > 0 and self._streak >= self._needed
+
+    def _begin_anew(self) -> None:
+        self._streak = self._states = 0
+        self.paced = False

@@ -84,6 +84,8 @@ class Figure(NamedTuple):
     build: Callable[[FlightData], dict[str, Any]]
     close: Callable[[FlightData], dict[str, Any] | None] | None = None
     """A second panel beside it, where it adds something."""
+    of_law: bool = False
+    """Whether it shows numbers that only the law has."""
 
 
 def _time_layout(flight: FlightData, titles: Sequence[str]) -> dict[str, Any]:
@@ -258,6 +260,7 @@ FIGURES: Final = (
         "The force that the law believes to act on the vehicle; a wrong mass or gravity shows as a force downwards.",
         600,
         force_estimates,
+        of_law=True,
     ),
     Figure(
         "errors",
@@ -265,6 +268,7 @@ FIGURES: Final = (
         "Position, velocity, acceleration and jerk errors of the law at the predicted time, all scaled to metres.",
         560,
         law_errors,
+        of_law=True,
     ),
     Figure(
         "actuation",
@@ -272,6 +276,7 @@ FIGURES: Final = (
         "What the law asked the autopilot for: thrust, body rates (after their limit) and angular accelerations.",
         660,
         actuation,
+        of_law=True,
     ),
 )
 """The figures in the order of the report."""

@@ -1,6 +1,13 @@
-"""The report's frame: markup, style and script. Marks between @@ are replaced by `report`."""
+"""The frame of a page: markup, style and script. Marks between @@ are replaced by `compose`."""
 
-from typing import Final
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
 
 PAGE: Final = """<!DOCTYPE html>
 <html lang="en">
@@ -117,3 +124,30 @@ window.addEventListener("afterprint", () => {
   }
 });
 """
+
+
+def compose(parts: Mapping[str, str], figures: Sequence[Mapping[str, Any]]) -> str:
+    """The whole page.
+
+    Args:
+        parts: HTML for the marks TITLE, SUBTITLE, VERDICT, VERDICT_CLASS ("passed" or "missed"), THRESHOLDS, TILES,
+            FIGURES (with an element for each figure's key) and TABLES.
+        figures: what plotly.js draws: "key", "data" and "layout".
+    """
+    from plotly.offline import get_plotlyjs  # 3.6 MB of script
+
+    # "</" would end the script element that holds the data.
+    data = json.dumps(figures, default=_encode_array, allow_nan=False).replace("</", "<\\/")
+    filled = {**parts, "STYLE": STYLE, "PLOTLY": get_plotlyjs(), "DATA": data, "SCRIPT": SCRIPT}
+    # One pass over the template's own marks, so that nothing inside an inserted part is taken for a mark.
+    pieces = PAGE.split("@@")
+    return "".join(filled[piece] if index % 2 else piece for index, piece in enumerate(pieces))
+
+
+def _encode_array(value: object) -> object:
+    """Arrays as plotly.js takes them: base64 of the numbers, which also holds NaN."""
+    if isinstance(value, np.ndarray):
+        return {"dtype": "f4", "bdata": base64.b64encode(value.astype("<f4").tobytes()).decode("ascii")}
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} does not belong into a figure")

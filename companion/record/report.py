@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import html
-import json
 import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +18,7 @@ from companion.record.columns import LIMIT_NAMES, TRACK_PHASE
 from companion.record.figures import FIGURES, FlightData
 from companion.record.flight_record import FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, read_summary, write_whole
-from companion.record.page import PAGE, SCRIPT, STYLE
+from companion.record.page import compose
 from companion.record.summary import PASSED
 
 REPORT_FILE: Final = "report.html"
@@ -117,13 +115,10 @@ def _merged(configuration: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def _page(name: str, flight: FlightData, configuration: Mapping[str, Any]) -> str:
-    from plotly.offline import get_plotlyjs
-
     figures, sections = _figures(flight)
     verdict = str(flight.summary.get("verdict", "unknown"))
     parts = {
         "TITLE": html.escape(name),
-        "STYLE": STYLE,
         "SUBTITLE": _subtitle(flight.summary),
         "VERDICT": html.escape(verdict),
         "VERDICT_CLASS": "passed" if verdict == PASSED else "missed",
@@ -131,30 +126,18 @@ def _page(name: str, flight: FlightData, configuration: Mapping[str, Any]) -> st
         "TILES": _tiles(flight.summary),
         "FIGURES": sections,
         "TABLES": _tables(flight, configuration),
-        "PLOTLY": get_plotlyjs(),
-        # "</" would end the script element that holds the data.
-        "DATA": json.dumps(figures, default=_encode_array, allow_nan=False).replace("</", "<\\/"),
-        "SCRIPT": SCRIPT,
     }
-    # One pass over the template's own marks, so that nothing inside an inserted part is taken for a mark.
-    pieces = PAGE.split("@@")
-    return "".join(parts[piece] if index % 2 else piece for index, piece in enumerate(pieces))
-
-
-def _encode_array(value: object) -> object:
-    """Arrays as plotly.js takes them: base64 of the numbers, which also holds NaN."""
-    if isinstance(value, np.ndarray):
-        return {"dtype": "f4", "bdata": base64.b64encode(value.astype("<f4").tobytes()).decode("ascii")}
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{type(value).__name__} does not belong into a figure")
+    return compose(parts, figures)
 
 
 def _figures(flight: FlightData) -> tuple[list[dict[str, Any]], str]:
     """What plotly.js draws, by the id of the element, and the sections with these elements."""
     drawn: list[dict[str, Any]] = []
     sections = []
+    by_law = _by_law(flight.summary)
     for figure in FIGURES:
+        if figure.of_law and not by_law:
+            continue
         panels = [{"key": figure.key, **figure.build(flight)}]
         if figure.close is not None and (close := figure.close(flight)) is not None:
             panels.append({"key": f"{figure.key}-close", **close})
@@ -169,11 +152,17 @@ def _figures(flight: FlightData) -> tuple[list[dict[str, Any]], str]:
     return drawn, "".join(sections)
 
 
+def _by_law(summary: Mapping[str, Any]) -> bool:
+    """Whether the law flew; else there are no numbers of it."""
+    return bool(summary.get("controller", "law") == "law")
+
+
 def _subtitle(summary: Mapping[str, Any]) -> str:
     rate = summary.get("control_rate_hz")
     words = [
         f"trajectory <b>{html.escape(str(summary.get('trajectory', '?')))}</b>",
         f"vehicle <b>{html.escape(str(summary.get('vehicle', '?')))}</b>",
+        "by <b>the law</b>" if _by_law(summary) else "by <b>PX4's own position controller</b>",
         f"{_number(summary.get('duration_s'))} s of tracking",
     ]
     if rate:
@@ -204,6 +193,7 @@ def _tiles(summary: Mapping[str, Any]) -> str:
     heading = summary.get("heading_rms_rad")
     tiles = [
         ("Position error, rms", _length(summary.get("position_rms_m")), window),
+        ("Whole track, rms", _length(summary.get("track_rms_m")), "the way to the path included"),
         ("95 % of the time below", _length(summary.get("position_p95_m")), window),
         ("Largest", _length(summary.get("position_max_m")), window),
         ("Vertical error, rms", _length(summary.get("vertical_rms_m")), window),
@@ -226,6 +216,8 @@ def _tiles(summary: Mapping[str, Any]) -> str:
         ("Steps", f"{summary.get('steps', 0)}", f"{summary.get('late_steps', 0)} late"),
         ("Lost setpoints", f"{summary.get('lost_setpoints', 0)}", "states that got no answer"),
     ]
+    if not _by_law(summary):
+        tiles = [tile for tile in tiles if tile[0] not in {"Disturbance", "Thrust"}]
     return "".join(_tile(*map(html.escape, tile)) for tile in tiles)
 
 
@@ -240,13 +232,14 @@ def _tables(flight: FlightData, configuration: Mapping[str, Any]) -> str:
         for entry in flight.summary.get("phases", [])
     ]
     reached = [(LIMIT_NAMES[bit], share) for bit, share in _limit_shares(flight.record)]
-    tables = [
-        _listing("Phases", ("phase", "from, s", "because"), phases),
-        _listing("Limits reached on the track", ("limit", "share of the steps"), reached, empty="None."),
-        _listing("Limits used", ("limit", "value"), _settings(flight.limits)),
-        _listing("Gains used", ("gain", "value"), _settings(_merged(configuration, "controller"))),
-    ]
-    return "".join(tables)
+    tables = [_listing("Phases", ("phase", "from, s", "because"), phases)]
+    if _by_law(flight.summary):
+        gains = _listing("Gains used", ("gain", "value"), _settings(_merged(configuration, "controller")))
+        tables.append(_listing("Limits reached on the track", ("limit", "share of the steps"), reached, empty="None."))
+    else:
+        read = flight.summary.get("px4_parameters", {})
+        gains = _listing("Parameters of PX4's controller", ("parameter", "value"), _settings(read))
+    return "".join((*tables, _listing("Limits used", ("limit", "value"), _settings(flight.limits)), gains))
 
 
 def _limit_shares(record: FlightRecord) -> list[tuple[int, str]]:

@@ -72,6 +72,8 @@ class FlightMeta:
     """Begin of the statistics on the trajectory [s]; None: 10 s after settling."""
     acceptance: Mapping[str, float] = field(default_factory=dict)
     """Thresholds: the largest value that passes, by summary key (`ACCEPTANCE_KEYS`)."""
+    controller: str = "law"
+    """Who followed the reference: "law", or "px4", whose record has none of the law's numbers."""
 
 
 def check_acceptance(acceptance: Mapping[str, object], where: str) -> None:
@@ -105,6 +107,7 @@ def summarise(record: FlightRecord, phases: Sequence[PhaseChange], meta: FlightM
     summary: dict[str, Any] = {
         "trajectory": meta.trajectory,
         "vehicle": meta.vehicle,
+        "controller": meta.controller,
         **_extent(steps, on_track),
         "settled_at_s": settled_at_s,
         "statistics_from_s": from_s,
@@ -150,12 +153,14 @@ def _extent(steps: FlightRecord, rows: npt.NDArray[np.intp]) -> dict[str, Any]:
 
 
 def _tracking(steps: FlightRecord, from_s: float | None) -> dict[str, Any]:
-    """How well the reference was followed from a time on the track until its end."""
+    """How well the reference was followed from a time on the track until its end; `track_rms_m`: from the track's
+    begin, there for flights that never settle too."""
     window = np.zeros(len(steps), dtype=np.bool_) if from_s is None else steps.column("track_s") >= from_s
     errors = _errors(steps)[window]
     distance = _norm(errors)
     heading = steps.column("heading_error_rad")[window]
     return {
+        "track_rms_m": _rms(_norm(_errors(steps))),
         "position_rms_m": _rms(distance),
         "position_p95_m": _percentile(distance, 95.0),
         "position_max_m": _largest(distance),
@@ -167,10 +172,10 @@ def _tracking(steps: FlightRecord, from_s: float | None) -> dict[str, Any]:
 
 def _effort(steps: FlightRecord) -> dict[str, Any]:
     """The last disturbance estimate, and the extremes of thrust and tilt."""
-    estimate = [_number(value) for value in steps.columns("b_hat_n", "b_hat_e", "b_hat_d")[-1]] if len(steps) else None
+    estimate = [_number(value) for value in steps.columns("b_hat_n", "b_hat_e", "b_hat_d")[-1]] if len(steps) else []
     thrust = steps.column("thrust_n")
     return {
-        "disturbance_m_s2": estimate,
+        "disturbance_m_s2": estimate if any(value is not None for value in estimate) else None,
         "thrust_min_n": _number(-value) if (value := _largest(-thrust)) is not None else None,
         "thrust_max_n": _largest(thrust),
         "tilt_max_rad": _largest(tilt(steps)),

@@ -8,11 +8,23 @@ from typing import Literal
 
 from companion.control.types import Reference, Vec3
 from companion.errors import RefusedError
+from companion.frames import GeoPoint
+from companion.trajectory.fence import Fence
 from companion.trajectory.shapes import ZERO, Joint, Shape
 from companion.trajectory.timing import paced, run_out, run_out_duration_s, scaled
 
 Anchor = Literal["here", "local", "home"]
 JoinKind = Literal["smooth", "law"]
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where the coordinates of a trajectory count from, on the Earth."""
+
+    point: GeoPoint
+    altitude_above_home: bool
+    """True: heights count from the vehicle's home, and the point's altitude means nothing. False: from the point's
+    altitude above mean sea level."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +41,12 @@ class Trajectory:
     join: JoinKind = "smooth"
     time_scale: float = 1.0
     """2.0 plays the shape twice as fast."""
+    origin: Origin | None = None
+    """Of coordinates that are places on the Earth; with the anchor "home" they are flown at these places."""
+    fence: Fence | None = None
+    """To be kept to, in the coordinates of the definition."""
+    notes: tuple[str, ...] = ()
+    """What people should know about where it comes from, a sentence each."""
 
     @property
     def period_s(self) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from math import floor, log10
 from typing import NamedTuple
@@ -87,7 +87,7 @@ def check(piece: Piece, limits: ReferenceLimits, model: PointMass) -> list[Viola
     Speed, acceleration, tilt, thrust and body rate are those of the reference itself, flown exactly, without
     disturbance: what the vehicle does while it settles is for a prediction to show.
     """
-    times_s = _grid(piece)
+    times_s = grid(piece)
     references = [piece.at(t_s) for t_s in times_s]
     for t_s, reference in zip(times_s, references, strict=True):
         if not finite(reference):
@@ -97,7 +97,8 @@ def check(piece: Piece, limits: ReferenceLimits, model: PointMass) -> list[Viola
     return violations + [_wrong_derivative(finding) for finding in findings(piece, times_s, references)]
 
 
-def _grid(piece: Piece) -> list[float]:
+def grid(piece: Piece) -> list[float]:
+    """Return the instants at which a piece is looked at, over its duration; of a closed one over one period [s]."""
     span_s = piece.duration_s if piece.period_s is None else min(piece.duration_s, piece.period_s)
     count = max(SAMPLES_MIN, min(SAMPLES_MAX, round(span_s / STEP_S)))
     return [span_s * i / count for i in range(count + 1)]
@@ -140,15 +141,27 @@ def _worst(
     def use(t_s: float) -> float:
         return uses(quantities(piece.at(t_s), model), limits)[index]
 
+    return highest(times_s, values, use)
+
+
+def highest(times_s: Sequence[float], values: Sequence[float], f: Callable[[float], float]) -> tuple[float, float]:
+    """Return when a function of time is largest [s], and its value there.
+
+    Args:
+        times_s: the instants of a scan.
+        values: the function there.
+        f: the function, for the highest peaks to be found between the instants.
+
+    """
     last = len(values) - 1
     peaks = [i for i in range(last + 1) if values[i] >= values[max(i - 1, 0)] and values[i] >= values[min(i + 1, last)]]
-    highest = max(values) * (1.0 - 1e-9)
-    best = next(i for i in range(last + 1) if values[i] >= highest)
+    top = max(values) * (1.0 - 1e-9)
+    best = next(i for i in range(last + 1) if values[i] >= top)
     worst = (times_s[best], values[best])
-    if min(values) >= highest:
+    if min(values) >= top:
         return worst
     for i in sorted(peaks, key=values.__getitem__, reverse=True)[:PEAKS_REFINED]:
-        refined = golden_maximum(use, times_s[max(i - 1, 0)], times_s[min(i + 1, last)])
+        refined = golden_maximum(f, times_s[max(i - 1, 0)], times_s[min(i + 1, last)])
         worst = max(worst, refined, key=lambda found: found[1])
     return worst
 

@@ -44,7 +44,8 @@ STATE_RATE_HZ = 100.0
 IN_AIR = ((0.0, 0.0, -20.0), 0.0)
 OFFBOARD, HOLD, LAND, TAKEOFF = (m.custom_mode for m in (Mode.OFFBOARD, Mode.HOLD, Mode.LAND, Mode.TAKEOFF))
 DO_SET_MODE, COMMAND_LONG, COMMAND_ACK = 176, 76, 77
-SETPOINTS = {codec.ID_SET_ATTITUDE_TARGET, codec.ID_SET_ACTUATOR_CONTROL_TARGET}
+SET_POSITION_TARGET_LOCAL_NED = 84
+SETPOINTS = {codec.ID_SET_ATTITUDE_TARGET, codec.ID_SET_ACTUATOR_CONTROL_TARGET, SET_POSITION_TARGET_LOCAL_NED}
 HOVER = {"shape": "hover", "anchor": "here", "duration_s": 1.5, "name": "hover", "hover": {"point_m": [0.0, 0.0, 0.0]}}
 INDOOR = {
     **{"shape": "lemniscate", "anchor": "here", "duration_s": 6.0, "name": "eight"},
@@ -127,7 +128,8 @@ class Stand:
         self.flight = flight
         path = folder / "vehicle.toml"
         path.write_text(tomlkit.dumps(_lists(flight.vehicle.model_dump(exclude_none=True))))
-        world = World(force_n=flight.world.force_n, gravity_factor=flight.world.gravity_factor, seed=1)
+        acts = flight.world
+        world = World(acts.force_n, acts.gravity_factor, acts.wind_m_s, acts.turbulence, seed=1)
         options.setdefault("engine", "python")
         self.vehicle = Vehicle(VehicleOptions(vehicle=load(str(path)), world=world, start=start, **options))
         self.port = free_udp_port()
@@ -252,7 +254,8 @@ class Stand:
             outcome = loop.run()
         flown = Flown(outcome, record, lines)
         if outcome.phases:
-            meta = FlightMeta("test", "paper", outcome.lost_setpoints, self.flight.statistics_from_s)
+            who = self.flight.output.controller
+            meta = FlightMeta("test", "paper", outcome.lost_setpoints, self.flight.statistics_from_s, controller=who)
             flown.summary = summarise(record, outcome.phases, meta)
         return flown
 

@@ -6,6 +6,7 @@ import math
 import socket
 import struct
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -59,6 +60,10 @@ class Companion:
         self.target = 1
         self.last: dict[str, object] = {}
         self.log: list[object] = []
+        self.waiting: deque[bytes] = deque()
+        self.raw: list[bytes] = []
+        self.bad_frames = False
+        """Whether frames may be broken on their way."""
         self.t_us = 0
         self.each: Callable[[], None] | None = None
         self.send(self.heartbeat())
@@ -72,8 +77,20 @@ class Companion:
 
     def receive(self):
         """One message from the vehicle, kept in `last` and `log`."""
-        data = self.sock.recv(2048)
-        message = self.mav.decode(bytearray(data))
+        if not self.waiting:
+            data = self.sock.recv(2048)
+            while data:  # in lockstep several frames come in one datagram
+                length = data[1] + (8 if data[0] == 0xFE else 12) if len(data) > 1 else 1
+                self.waiting.append(data[:length])
+                data = data[length:]
+        raw = self.waiting.popleft()
+        self.raw.append(raw)
+        try:
+            message = self.mav.decode(bytearray(raw))
+        except mavlink.MAVError:
+            if not self.bad_frames:
+                raise
+            return mavlink.MAVLink_bad_data(raw, "broken on its way")
         self.last[message.get_type()] = message
         self.log.append(message)
         return message

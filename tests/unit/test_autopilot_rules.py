@@ -38,7 +38,8 @@ def test_packed_modes_are_px4_s():
     assert from_numbers(6, 9) is Mode.OFFBOARD
     assert from_numbers(4, 77) is None
     assert from_numbers(3, 1) is None, "orbit is not flown here"
-    assert {mode for mode in Mode if not mode.can_arm} == {Mode.RETURN, Mode.LAND, Mode.TERMINATION}
+    assert {mode for mode in Mode if not mode.can_arm} == {Mode.RETURN, Mode.LAND, Mode.DESCEND, Mode.TERMINATION}
+    assert from_numbers(4, 20) is None, "Descend cannot be asked for"
 
 
 @pytest.mark.parametrize(

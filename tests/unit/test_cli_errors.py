@@ -76,7 +76,7 @@ def test_what_the_command_line_does_not_know(refusal: Refusal, arguments: list[s
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["simulate", "papr"], "no flight file 'papr': neither a path nor one of the bundled ones (eight, paper)"),
+        (["simulate", "papr"], "'papr': neither a path nor one of the bundled ones (eight, paper, windtest)"),
         (["demo", "--flight", "papr"], "no flight file 'papr'"),
         (["certify", "papr"], "file 'papr': neither a path nor one of the bundled ones"),
         (["fly", "papr", "--vehicle", "bundled"], "no trajectory file 'papr'"),
@@ -89,6 +89,12 @@ def test_what_the_command_line_does_not_know(refusal: Refusal, arguments: list[s
         (["simulate", "eight", "--time-scale", "nan"], "time_scale = nan"),
         (["demo", "--output", "torque"], "output.kind = 'torque': input should be 'rates', 'attitude' or 'actuators'"),
         (["demo", "--state-age", "-0.1"], "state_age_s = -0.1"),
+        (["demo", "--wind", "-12,0"], "--wind '-12,0': expected three numbers north,east,down in m/s"),
+        (["demo", "--wind", "nan,0,0"], "world.wind_m_s.0 = nan"),
+        (["demo", "--turbulence", "-0.1"], "world.turbulence = -0.1"),
+        (["demo", "--controller", "pid"], "output.controller = 'pid': input should be 'law' or 'px4'"),
+        (["demo", "--controller", "px4", "--output", "rates"], "the reference itself is sent: leave one out"),
+        (["fly", "circle", "--vehicle", "bundled", "--controller", "px4", "--output", "rates"], "leave one out"),
         (["certify", "eight", "--start", "1,2"], "--start '1,2': expected three numbers"),
     ],
 )

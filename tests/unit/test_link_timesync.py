@@ -48,7 +48,7 @@ def drive(peer: PacedPeer, count: int, every_us: int, request_every: int, start_
         peer.on_state(start_us + i * every_us)
         paced.append(peer.paced)
         if (i + 1) % request_every == 0:
-            peer.on_request()
+            peer.on_request((start_us + i * every_us) * 1_000)
     return paced
 
 
@@ -65,26 +65,36 @@ def test_px4_with_a_slow_state_never_looks_paced():
     assert not any(drive(PacedPeer(), 100, 100_000, 1))
 
 
-def test_one_state_without_its_request_ends_it():
+def test_a_state_far_beyond_the_last_request_ends_it():
     peer = PacedPeer()
     drive(peer, 12, 4_000, 1)
     assert peer.paced
     peer.on_state(2_000_000)
-    assert peer.paced
-    peer.on_state(2_004_000)
+    assert not peer.paced
+    peer.on_request(2_000_000_000)
     assert not peer.paced
 
 
-def test_a_paced_vehicle_may_leave_states_out():
+def test_states_of_a_paced_vehicle_may_be_lost_late_and_bunched():
     peer = PacedPeer()
     drive(peer, 12, 4_000, 1)
-    peer.on_state(1_500_000)
-    assert peer.paced
+    for i in range(100):
+        for late_us in (24_000, 20_000, 16_000) if i % 6 == 0 else ():
+            peer.on_state(1_048_000 + i * 4_000 - late_us)
+        peer.on_request((1_048_000 + i * 4_000) * 1_000)
+        assert peer.paced
+
+
+def test_a_vehicle_that_stops_asking_for_a_while_begins_anew():
+    peer = PacedPeer()
+    drive(peer, 12, 4_000, 1)
+    peer.on_request(2_000_000_000)
+    assert not peer.paced
+    assert drive(peer, 15, 4_000, 1, start_us=2_004_000)[-1]
 
 
 def test_requests_alone_are_not_enough():
     peer = PacedPeer()
-    for _ in range(50):
-        peer.on_request()
-    peer.on_state(1_000)
+    for i in range(50):
+        peer.on_request((1_000_000 + i * 4_000) * 1_000)
     assert not peer.paced

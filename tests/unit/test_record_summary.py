@@ -11,7 +11,8 @@ from companion.record.flight_record import FlightRecord
 from companion.record.summary import FlightMeta, PhaseChange, check_acceptance, summarise, without_wall_clock
 
 KEYS = [
-    *("trajectory", "vehicle", "duration_s", "steps", "control_rate_hz", "settled_at_s", "statistics_from_s"),
+    *("trajectory", "vehicle", "controller", "duration_s", "steps", "control_rate_hz"),
+    *("settled_at_s", "statistics_from_s", "track_rms_m"),
     *("position_rms_m", "position_p95_m", "position_max_m", "vertical_rms_m", "heading_rms_rad"),
     *("body_sideways_rms_m_s", "disturbance_m_s2", "thrust_min_n", "thrust_max_n", "tilt_max_rad"),
     *("state_age_ms", "step_us", "late_steps", "lost_setpoints", "phases", "verdict"),

@@ -80,7 +80,7 @@ def test_the_array_has_room_for_every_field() -> None:
     assert size(RigidState, p=3, v=3, q=4, w=3, rotor_n=4) == flat.LOOPS - flat.RIGID
     assert size(LoopState, integral=3, w_previous=3, rates=3, q_ref=4, w_ref=3) == flat.ORDER - flat.LOOPS
     assert size(Setpoint, rates=3, q=4, torque=3) == flat.FRESH - flat.ORDER
-    rotors = {name: 4 for name in Body._fields if re.match("rotor_(x|y|yaw)_m", name)}
+    rotors = {name: 4 for name in Body._fields if re.match("rotor_((x|y|yaw)_m|share)$", name)}
     assert size(Body, inertia_kg_m2=3, **rotors) == flat.GAINS - flat.BODY
     vectors = dict.fromkeys(("rate_p", "rate_i", "rate_d", "attitude_p", "rate_max"), 3)
     mixes = {name: 4 for name in LoopGains._fields if name.startswith("mix_")}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sim_cases import LEVEL, NOTHING, OFF, PAPER, noiseless
 
-from sim_link.estimator import NOISE_ROWS, Estimator, NoiseBlocks, noise_block
+from sim_link.estimator import NOISE_ROWS, Estimator, Noise, NoiseBlocks, noise_block, noise_of
 from sim_link.physics import RigidState
 from sim_link.rotation import exponential, logarithm, multiply
 from sim_link.vehicle_file import VehicleFile
@@ -63,6 +63,19 @@ def test_noise_does_not_depend_on_who_asks_when() -> None:
         assert often.believed() is often.believed()
     assert often.believed() == seldom.believed()
     assert often.believed() != other.believed()
+
+
+def test_noise_can_be_scaled_and_the_same_numbers_are_drawn() -> None:
+    assert noise_of(PAPER) == (0.002, 0.005, 0.0005, 0.002)
+    assert noise_of(PAPER, 3.0) == pytest.approx((0.006, 0.015, 0.0015, 0.006))
+    one, three, none = estimator(PAPER), estimator(PAPER), estimator(PAPER)
+    before = three.believed()
+    three.set_noise(noise_of(PAPER, 3.0))
+    none.set_noise(Noise(0.0, 0.0, 0.0, 0.0))
+    assert three.believed().t_us == before.t_us
+    for small, large in zip(one.believed().v, three.believed().v, strict=True):
+        assert large == pytest.approx(3.0 * small)
+    assert (none.believed().p, none.believed().v) == (NOTHING, NOTHING)
 
 
 def test_noise_blocks_are_a_fixed_function_of_seed_and_number() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from sim_cases import PAPER
 
+from companion.config import Noise
 from sim_link import vehicle_file
 from sim_link.vehicle_file import VehicleFileError, find, load, parse
 
@@ -36,6 +37,25 @@ def test_bundled_vehicle_is_read() -> None:
     assert PAPER.rotor_y_m == (0.25, -0.25, -0.25, 0.25)
     assert PAPER.rate_lag_s == (0.040, 0.040, 0.080)
     assert PAPER.noise_attitude_rad == 0.0005
+
+
+def test_the_bias_walk_may_be_left_out() -> None:
+    names = ["position_walk_m_per_sqrt_s", "velocity_walk_m_s_per_sqrt_s", "yaw_walk_rad_per_sqrt_s"]
+    names += ["rate_walk_rad_s_per_sqrt_s", "walk_time_constant_s"]
+    content = document()
+    for name in names:
+        content["noise"].pop(name, None)
+    v = parse(content, "some.toml")
+    walk = (v.walk_position_m, v.walk_velocity_m_s, v.walk_yaw_rad, v.walk_rate_rad_s, v.walk_time_constant_s)
+    assert walk == (0.0,) * 5
+    content["noise"].update(zip(names, (1, 2.0, 3.0, 4.0, 5.0), strict=True))
+    v = parse(content, "some.toml")
+    walk = (v.walk_position_m, v.walk_velocity_m_s, v.walk_yaw_rad, v.walk_rate_rad_s, v.walk_time_constant_s)
+    assert walk == (1.0, 2.0, 3.0, 4.0, 5.0)
+    content["noise"]["yaw_walk_rad_per_sqrt_s"] = -0.1
+    assert "noise.yaw_walk_rad_per_sqrt_s = -0.1: must be 0 or more" in refusal(content)
+    assert set(names) <= set(Noise.model_fields), "the companion reads the same file"
+    assert set(names) <= set(tomllib.loads(find("bundled").read_text(encoding="utf-8"))["noise"])
 
 
 def test_every_bundled_vehicle_can_be_simulated() -> None:

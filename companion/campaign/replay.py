@@ -1,0 +1,142 @@
+"""A recorded flight's states through today's controller: what it would have commanded, beside what was sent.
+
+The states, their stamps and how the flight was engaged come from the flight's folder; the reference is planned anew
+from them. With the folder's own configuration and the same program the commands are the recorded ones to the last bit,
+so every difference is one of gains, vehicle file or code. The states are those of the old commands: a replay says how
+two controllers answer the same states, not how the new one would have flown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.config import Flight, build_flight, read_toml
+from companion.control import flat
+from companion.control.output import thrust_of
+from companion.control.types import State
+from companion.errors import InputError
+from companion.flight.controller import controller_of
+from companion.flight.course import ZERO, Course
+from companion.flight.phases import Engagement
+from companion.flight.tracker import Kernels
+from companion.record.flight_record import FlightRecord
+from companion.record.folder import CONFIGURATION_FILE, read_summary
+from companion.trajectory.load import of_flight
+
+Array = npt.NDArray[np.float64]
+
+COMMANDS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
+    "thrust sent": ("of full", ("thrust_cmd",)),
+    "thrust": ("N", ("thrust_n",)),
+    "body rates": ("rad/s", ("rate_cmd_x", "rate_cmd_y", "rate_cmd_z")),
+    "angular acceleration": ("rad/s^2", ("tau_x", "tau_y", "tau_z")),
+    "disturbance estimate": ("m/s^2", ("b_hat_n", "b_hat_e", "b_hat_d")),
+}
+"""What is compared: unit, and the record's columns."""
+_PROGRESS_ROWS: Final = 500
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far a command of the replay is from the recorded one."""
+
+    name: str
+    unit: str
+    largest: float
+    rms: float
+    first_s: float | None
+    """Vehicle time since the flight was engaged at which the two differ first; None: never."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Recorded and replayed commands, row by row."""
+
+    flight: Flight
+    recorded: FlightRecord
+    replayed: dict[str, Array]
+    """By column of the record, shape (rows,)."""
+    time_s: Array
+    """Since the flight was engaged, shape (rows,)."""
+
+    @property
+    def differences(self) -> list[Difference]:
+        """One per entry of COMMANDS."""
+        return [self._difference(name, unit, columns) for name, (unit, columns) in COMMANDS.items()]
+
+    @property
+    def identical(self) -> bool:
+        """Whether every command is the recorded one to the last bit."""
+        return all(found.first_s is None for found in self.differences)
+
+    def _difference(self, name: str, unit: str, columns: tuple[str, ...]) -> Difference:
+        before = self.recorded.columns(*columns)
+        after = np.column_stack([self.replayed[column] for column in columns])
+        both_nan = np.isnan(before) & np.isnan(after)
+        apart = np.linalg.norm(np.where(both_nan, 0.0, after - before), axis=1)
+        differs = np.flatnonzero(np.any((before != after) & ~both_nan, axis=1))
+        first_s = float(self.time_s[differs[0]]) if len(differs) else None
+        return Difference(name, unit, float(np.max(apart)), float(np.sqrt(np.mean(apart * apart))), first_s)
+
+
+def replay(
+    folder: Path, engine: Kernels, changed: Flight | None = None, progress: Callable[[float], None] = lambda share: None
+) -> Replay:
+    """Compute the commands of a recorded flight again.
+
+    Args:
+        folder: the flight's folder.
+        engine: the arithmetic.
+        changed: another configuration (gains, vehicle); None: the folder's own.
+        progress: called now and then with the share that is done.
+
+    Raises:
+        InputError: the folder holds no flight that can be replayed.
+        RefusedError: with the changed configuration the course cannot be flown.
+    """
+    configuration = folder / CONFIGURATION_FILE
+    flight = changed or build_flight(read_toml(configuration), str(configuration))
+    if flight.output.controller != "law":
+        raise InputError(f"{folder}: PX4's own controller flew; a replay computes the law's commands")
+    record = FlightRecord.load(folder)
+    engagement = _engagement(folder)
+    if not len(record):
+        raise InputError(f"{folder}: the record is empty, the flight was never engaged")
+    trajectory = of_flight(flight)
+    course = Course(trajectory, flight.vehicle, engagement.hold_point_m, engagement.yaw_rad, engagement.home_m)
+    tracker = controller_of(flight, engine)
+    rows = record.rows
+    begin_s = engagement.at_s
+    tracker.begin(State(ZERO, ZERO, engagement.attitude, ZERO), engagement.thrust_n)
+    replayed = {column: np.full(len(rows), np.nan) for _, columns in COMMANDS.values() for column in columns}
+    table = np.column_stack([rows[:, 0], record.columns(*_STATE)])
+    for index, (stamp_s, *x) in enumerate(table.tolist()):
+        state = State((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8], x[9]), (x[10], x[11], x[12]))
+        out = tracker.step(stamp_s, state, lambda t: course.at(t - begin_s))
+        n = out.numbers
+        values = (thrust_of(out.setpoint), n[flat.TOTAL], *n[flat.RATES], *n[flat.TAU], *n[flat.B_HAT])
+        for column, value in zip(replayed, values, strict=True):
+            replayed[column][index] = value
+        if index % _PROGRESS_ROWS == 0:
+            progress(index / len(rows))
+    return Replay(flight, record, replayed, rows[:, 0] - begin_s)
+
+
+_STATE: Final = ("p_n", "p_e", "p_d", "v_n", "v_e", "v_d", "q_w", "q_x", "q_y", "q_z", "w_x", "w_y", "w_z")
+
+
+def _engagement(folder: Path) -> Engagement:
+    """How the flight began, from its summary. Raises InputError."""
+    entry = read_summary(folder).get("engagement")
+    if entry is None:
+        raise InputError(f"{folder}: the summary does not say how the flight was engaged; it never was, or is too old")
+    try:
+        return Engagement.from_numbers(entry)
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(f"{folder}: summary.json: engagement: {error}; give the folder of a flight") from None

@@ -1,0 +1,41 @@
+"""Who follows the reference: the law, or PX4's own position controller. A flight chooses one of them on the ground."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from companion.config import Flight
+from companion.control.types import State
+from companion.flight.baseline import Px4Baseline
+from companion.flight.tracker import Kernels, ReferenceAt, Tracker, TrackerStep
+
+
+class Controller(Protocol):
+    """Answers every state with one setpoint; its time is the vehicle's, and it knows nothing of sockets."""
+
+    def begin(self, state: State, thrust_n: float | None = None) -> None:
+        """Starts from a hover.
+
+        Args:
+            state: the vehicle now.
+            thrust_n: the thrust that acts [N]; None: unknown.
+        """
+        ...
+
+    def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
+        """The setpoint for one state.
+
+        Args:
+            stamp_s: vehicle time of the state [s].
+            state: as received.
+            reference_at: the reference as a function of vehicle time [s].
+            frozen: hold what is estimated still.
+        """
+        ...
+
+
+def controller_of(flight: Flight, compiled: Kernels) -> Controller:
+    """The controller that a flight asks for ([output] controller)."""
+    if flight.output.controller == "px4":
+        return Px4Baseline(flight.vehicle)
+    return Tracker(flight.vehicle, flight.output.kind, compiled)

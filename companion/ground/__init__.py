@@ -1,0 +1,1 @@
+"""What an operator's tools talk to: `companion serve` at component 191, and the client that commands it."""

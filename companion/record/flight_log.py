@@ -1,0 +1,262 @@
+"""Turns what the control process hands over into the bytes of `flight.ulg`: rows, traffic and texts, as they come.
+
+The file begins when the vehicle's time is known, because all its times are the vehicle's; texts that come before that
+wait for it.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+import struct
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
+from operator import itemgetter
+from typing import Any, Final
+
+from companion import __version__
+from companion.frames import wrap_angle, yaw_from_quat
+from companion.record import topics, ulog
+from companion.record.columns import COLUMN_INDEX, COLUMNS
+from companion.record.tlog import Direction
+from companion.record.traffic import Traffic
+from companion.record.ulog import Level, Number, Series, Topic
+
+__all__ = ["Entry", "FlightLog", "Level"]
+
+_SYNC_US: Final = 1_000_000
+_HELD_TEXTS: Final = 200
+_RELEASE: Final = 255  # FIRMWARE_VERSION_TYPE_OFFICIAL
+_ROW = struct.Struct(f"={len(COLUMNS)}d")
+_T_S, _LYAPUNOV, _HEADING_ERROR = (COLUMN_INDEX[name] for name in ("t_s", "lyapunov", "heading_error_rad"))
+_Q = slice(COLUMN_INDEX["q_w"], COLUMN_INDEX["q_z"] + 1)
+_B_HAT = slice(COLUMN_INDEX["b_hat_n"], COLUMN_INDEX["b_hat_d"] + 1)
+
+
+class Entry(IntEnum):
+    """Kinds of entries beside the directions of datagrams (`tlog.Direction`)."""
+
+    ROW = 16
+    """A row of the flight's record: doubles in the order of `columns.COLUMNS`."""
+    TEXT = 17
+    """A severity in one byte, and UTF-8."""
+
+
+class FlightLog:
+    """The log of one flight. Its methods return what is to be appended to the file.
+
+    Args:
+        configuration: the text of flight.toml.
+        epoch_minus_wall_ns: turns monotonic into epoch nanoseconds.
+    """
+
+    def __init__(self, configuration: str, epoch_minus_wall_ns: int) -> None:
+        self._text = configuration
+        self._settings = _read(configuration)
+        self._epoch_minus_wall_ns = epoch_minus_wall_ns
+        self._series = {topic.name: Series(topic, number) for number, topic in enumerate(topics.TOPICS)}
+        self._steps = [(self._series[topic.name], _getter(topic)) for topic in topics.STEP_TOPICS]
+        self._traffic = Traffic(self._write, self._say, self._set, epoch_minus_wall_ns)
+        self._out: list[bytes] = []
+        self._held: list[tuple[int, str]] = []
+        self._begun = False
+        self._synced_us = 0
+        self._envelope: float | None = None
+        self._row_us: int | None = None
+        self._interval_us = 0
+        self._gap = False
+
+    def take(self, kind: int, content: bytes, wall_ns: int) -> bytes:
+        """One entry.
+
+        Args:
+            kind: a `tlog.Direction` or an `Entry`.
+            content: the datagram, row or text.
+            wall_ns: monotonic time of a datagram.
+        """
+        if kind == Entry.ROW:
+            self._take_row(content)
+        elif kind == Entry.TEXT:
+            self._say(content[0], content[1:].decode("utf-8", "replace"))
+        elif kind in {Direction.IN, Direction.OUT}:
+            self._traffic.take(kind, content, wall_ns)
+        self._begin_when_time_is_known(wall_ns)
+        return self._taken()
+
+    def missed(self, count: int) -> None:
+        """So many entries, counted from the beginning, did not get here."""
+        self._gap = self._gap or count > self._traffic.dropped
+        self._traffic.dropped = count
+
+    def end(self) -> bytes:
+        """What is left; a flight without a vehicle's time still gives a log with its texts."""
+        if not self._begun:
+            self._begin(0, 0)
+        self._out.append(ulog.sync())
+        return self._taken()
+
+    def _taken(self) -> bytes:
+        if not self._begun:
+            return b""
+        out = b"".join(self._out)
+        self._out.clear()
+        return out
+
+    # -- the beginning --------------------------------------------------------------------------------------------
+
+    def _begin_when_time_is_known(self, wall_ns: int) -> None:
+        now_us = self._traffic.now_us
+        if now_us is None:
+            return
+        if not self._begun:
+            self._begin(now_us, wall_ns)
+        elif now_us - self._synced_us >= _SYNC_US:
+            self._synced_us = now_us
+            self._out.append(ulog.sync())
+
+    def _begin(self, start_us: int, wall_ns: int) -> None:
+        """The header and all definitions, before what has come already."""
+        self._begun = True
+        self._synced_us = start_us
+        parts = [ulog.header(start_us)]
+        parts += [ulog.format_definition(topic) for topic in topics.TOPICS]
+        parts += self._facts((wall_ns + self._epoch_minus_wall_ns) // 1000 if wall_ns else None)
+        numbers = {"MAV_TYPE": self._traffic.vehicle_type, **dict(_numbers(self._settings))}
+        parts += [ulog.parameter(key, value) for key, value in numbers.items() if value is not None]
+        parts += [ulog.subscription(topic, number) for number, topic in enumerate(topics.TOPICS)]
+        parts += [ulog.logged(level, start_us, text) for level, text in self._held]
+        self._held.clear()
+        self._out[:0] = parts
+
+    def _facts(self, epoch_us: int | None) -> Iterator[bytes]:
+        yield ulog.info("sys_name", "companion")
+        yield ulog.info("ver_sw", __version__)
+        yield ulog.info("ver_sw_release", _release(__version__), "uint32_t")
+        yield ulog.info("sys_os_name", platform.system())
+        yield ulog.info("sys_os_ver", platform.release())
+        for key, name in (("flight", self._settings.get("name")), ("vehicle", _name(self._settings, "vehicle")),
+                          ("trajectory", _name(self._settings, "trajectory"))):  # fmt: skip
+            if isinstance(name, str):
+                yield ulog.info(key, name)
+        yield ulog.info("time_ref_utc", 0, "int32_t")
+        if epoch_us is not None:
+            yield ulog.info("time_utc_usec", epoch_us)
+        if self._text:
+            yield ulog.long_info("flight_toml", self._text)
+
+    # -- what comes -----------------------------------------------------------------------------------------------
+
+    def _write(self, topic: Topic, t_us: int, values: Sequence[Number]) -> None:
+        self._out.append(self._series[topic.name].encode(t_us, values))
+
+    def _say(self, level: int, text: str) -> None:
+        now_us = self._traffic.now_us
+        if self._begun:
+            self._out.append(ulog.logged(level, now_us or 0, text))
+        elif len(self._held) < _HELD_TEXTS:
+            self._held.append((level, text))
+
+    def _set(self, name: str, value: Number) -> None:
+        """A parameter of the autopilot: behind the definitions a change, as its value was not known there."""
+        if self._begun:
+            self._out.append(ulog.parameter(name, value))
+
+    def _take_row(self, content: bytes) -> None:
+        row = _ROW.unpack(content)
+        t_us = round(row[_T_S] * 1e6)
+        self._mark_gap(t_us)
+        yaw = wrap_angle(yaw_from_quat(row[_Q]) - row[_HEADING_ERROR])  # type: ignore[arg-type]
+        if self._envelope is None:
+            self._envelope = envelope(self._settings, row[_LYAPUNOV], row[_B_HAT])
+        numbers = (*row, yaw, self._envelope)
+        for series, values in self._steps:
+            self._out.append(series.encode(t_us, values(numbers)))
+
+    def _mark_gap(self, t_us: int) -> None:
+        """After entries were lost: where rows are missing, for how long."""
+        last_us, self._row_us = self._row_us, t_us
+        if last_us is None:
+            return
+        passed_us = t_us - last_us
+        if self._gap and passed_us > 1.5 * self._interval_us:
+            self._gap = False
+            self._out.append(ulog.dropout(1e-3 * passed_us))
+        else:
+            self._interval_us = passed_us
+
+
+def _getter(topic: Topic) -> itemgetter[Any]:
+    """Takes a step topic's numbers out of a row with the derived numbers behind it."""
+    places = {name: index for index, name in enumerate((*COLUMNS, *topics.DERIVED))}
+    return itemgetter(*[places[name] for field in topic.fields for name in field.columns])
+
+
+def envelope(settings: Mapping[str, Any], value: float, b_hat: Sequence[float]) -> float:
+    """What V_H without its b_tilde term does not rise above by the proof of docs/law.md section 4 [m^2].
+
+    V_H(0) + (B + |b_hat(0)|)^2 / (2 k1 Gamma), with the largest disturbance B for the unknown one. NaN where nothing
+    is promised: without an estimator, or without its settings.
+
+    Args:
+        settings: the flight's configuration.
+        value: V_H without its b_tilde term at the first step [m^2].
+        b_hat: the estimate there, NED [m/s^2].
+    """
+    vehicle = settings.get("vehicle", {})
+    try:
+        k1, gamma = float(vehicle["controller"]["k1_1_s"]), float(vehicle["controller"]["gamma_1_s3"])
+        most = float(vehicle["limits"]["disturbance_max_m_s2"])
+    except (KeyError, TypeError, ValueError):
+        return math.nan
+    if not k1 * gamma > 0.0:
+        return math.nan
+    return value + (most + math.hypot(*b_hat)) ** 2 / (2.0 * k1 * gamma)
+
+
+# ---- the configuration ----------------------------------------------------------------------------------------------
+
+
+def _read(text: str) -> dict[str, Any]:
+    """The flight's configuration; empty when it cannot be read: the text is in the log all the same."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return {}
+
+
+def _name(settings: Mapping[str, Any], key: str) -> object:
+    """The name in a table, or the name that stands in its place."""
+    table = settings.get(key)
+    return table.get("name") if isinstance(table, Mapping) else table
+
+
+def _numbers(settings: Mapping[str, Any]) -> Iterator[tuple[str, Number]]:
+    """Every number of the configuration by its path; the vehicle's tables stand beside the flight's. Trajectories can
+    be long, and are left to the text."""
+    for key, value in settings.items():
+        if key == "vehicle" and isinstance(value, Mapping):
+            for inner, below in value.items():
+                yield from _flat(inner, below)
+        elif key != "trajectory":
+            yield from _flat(key, value)
+
+
+def _flat(path: str, value: object) -> Iterator[tuple[str, Number]]:
+    if isinstance(value, Mapping):
+        for key, below in value.items():
+            yield from _flat(f"{path}/{key}", below)
+    elif isinstance(value, list):
+        for index, below in enumerate(value):
+            yield from _flat(f"{path}/{index}", below)
+    elif isinstance(value, bool):
+        yield path, int(value)
+    elif isinstance(value, int | float):
+        yield path, value
+
+
+def _release(version: str) -> int:
+    """The version as PX4 packs one: major, minor, patch, and "release"."""
+    parts = [int("".join(c for c in part if c.isdigit()) or 0) & 0xFF for part in version.split(".")[:3]]
+    major, minor, patch = (*parts, 0, 0, 0)[:3]
+    return major << 24 | minor << 16 | patch << 8 | _RELEASE

@@ -1,0 +1,79 @@
+"""Missions in the text format QGC WPL 110: index, current, frame, command, four parameters, x, y, z, autocontinue.
+
+Where the first item is absolute while it is also the current one, it is the home position, as ground stations write it.
+"""
+
+from __future__ import annotations
+
+from companion.frames import Frame, GeoPoint
+from companion.trajectory.formats.contents import Route
+from companion.trajectory.formats.mission import TAKEOFF, WAYPOINT, Item, fence_items, route
+from companion.trajectory.formats.reading import Row, Source, first_line, lines_of, number
+
+COLUMNS = ("index", "current", "frame", "command", "p1", "p2", "p3", "p4", "x", "y", "z", "autocontinue")
+SIGNATURE = "QGC WPL"
+VERSION = "110"
+INTEGER_MAX = 65535.0
+
+
+def matches(source: Source) -> bool:
+    """Whether it begins as such a file."""
+    return first_line(source)[1].startswith(SIGNATURE)
+
+
+def read(source: Source, frame: Frame) -> Route:
+    """Return the points of a mission, in north-east-down from its home. Raises InputError."""
+    line, text = first_line(source)
+    if text.split() != [*SIGNATURE.split(), VERSION]:
+        raise source.fault(line, f"the first line must be {SIGNATURE} {VERSION}")
+    rows = []
+    for at, row in list(lines_of(source))[1:]:
+        cells = row.split()
+        if len(cells) != len(COLUMNS):
+            raise source.fault(at, f"{len(cells)} columns, {len(COLUMNS)} are expected; is the file cut off?")
+        # Ground stations write NaN for what is not set; zero says the same in these columns, but for the heading.
+        values = [_value(source, at, cell, name) for cell, name in zip(cells, COLUMNS, strict=True)]
+        rows.append((Row(at, tuple(0.0 if value is None else value for value in values)), values))
+    if not rows:
+        raise source.fault(line, "has no items")
+    items = [_item(source, row, values) for row, values in rows]
+    home = _home(rows[0][0])
+    return route(source, items if home is None else items[1:], home, fence=fence_items(source, items))
+
+
+def _value(source: Source, line: int, cell: str, name: str) -> float | None:
+    if cell.lower() == "nan" and name in {"p1", "p2", "p3", "p4", "x", "y"}:
+        return None
+    return number(source, line, cell, name)
+
+
+def _item(source: Source, row: Row, values: list[float | None]) -> Item:
+    for name, value in zip(COLUMNS[:4], row.values[:4], strict=True):
+        if not (value.is_integer() and 0.0 <= value <= INTEGER_MAX):
+            raise source.fault(row.line, f"{name} is {value:g}; it must be a whole number")
+    command = int(row.values[3])
+    # Zero is how these files leave the heading open: north would be 360.
+    yaw_deg = values[7] if values[7] != 0.0 else None
+    return Item(
+        row.line,
+        f"item {row.values[0]:g}",
+        command,
+        int(row.values[2]),
+        values[4],
+        values[5],
+        yaw_deg if command in (WAYPOINT, TAKEOFF) else values[7],
+        values[8],
+        values[9],
+        values[10],
+    )
+
+
+def _home(row: Row) -> GeoPoint | None:
+    """The home position, when the first item is one."""
+    index, current, frame, command = row.values[:4]
+    latitude, longitude, altitude = row.values[8:11]
+    if (index, current, frame, command) != (0.0, 1.0, 0.0, float(WAYPOINT)):
+        return None
+    if abs(latitude) > 90.0 or abs(longitude) > 180.0 or abs(altitude) > 9000.0 or latitude == longitude == 0.0:
+        return None
+    return GeoPoint(latitude, longitude, altitude)
