@@ -78,7 +78,7 @@ class Battery:
         if not self.is_sized or self.current_a <= 0.0:
             return 0
         left_mah = self.remaining * self._parameters.number("BAT1_CAPACITY")
-        return max(1, round(min(left_mah * 3.6 / self.current_a, _TIME_MAX_S)))
+        return max(1, round(min(_TIME_MAX_S, left_mah * 3.6 / self.current_a)))  # in this order NaN gives the limit
 
     def update(self, rotor_n: Vec4, armed: bool, dt_s: float) -> None:
         """Draw for dt_s the power that rotor thrusts [N] need: as thrust^(3/2), as a rotor in hover does."""

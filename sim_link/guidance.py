@@ -22,6 +22,7 @@ _NEAR_M = 0.3
 _TURN_FROM_M = 2.0
 """Further away than this a mission turns the nose to where it flies."""
 _SLIP_LEAST_M = 0.001
+_NUMBER_MAX = 1.0e6
 _BLIND_DESCENT_M_S2 = 0.3
 """Downwards, when there is no estimate to descend by (FlightTaskDescend.cpp)."""
 _RETURN_NEAR_M = 10.0
@@ -78,7 +79,7 @@ class Guidance:
         self.speed_m_s = None
         self._return_stage = 0
         self._slip, self._slip_m_s = (0.0, 0.0, 0.0), 0.0
-        climb = self._parameters.number("RTL_RETURN_ALT")
+        climb = self._number("RTL_RETURN_ALT")
         self._return_to = self._nearest_return(p)
         near = math.hypot(p[0] - self._return_to[0], p[1] - self._return_to[1]) < _RETURN_NEAR_M
         self._return_d = p[2] if near else min(p[2], self.home[2] - climb)
@@ -107,10 +108,10 @@ class Guidance:
     def _begin_takeoff(self, p: Vec3) -> None:
         """Fix the height of a takeoff; one that would lead down ends where it is."""
         if self.takeoff_height_m is None:
-            down = p[2] - self._parameters.number("MIS_TAKEOFF_ALT")
+            down = p[2] - self._number("MIS_TAKEOFF_ALT")
         else:
             # PX4 raises a height that is less than MIS_TAKEOFF_ALT above home.
-            down = self.home[2] - max(self.takeoff_height_m, self._parameters.number("MIS_TAKEOFF_ALT"))
+            down = self.home[2] - max(self.takeoff_height_m, self._number("MIS_TAKEOFF_ALT"))
         self._takeoff_d = min(down, p[2])
         self._anchor = (p[0], p[1], self._takeoff_d)
         self._v = (0.0, 0.0, 0.0)
@@ -171,7 +172,7 @@ class Guidance:
         if self._mode is Mode.POSITION:
             return self._position(p, v, dt_s)
         if self._mode is Mode.LAND:
-            return self._land(p, v, dt_s, self._parameters.number("MPC_LAND_SPEED"))
+            return self._land(p, v, dt_s, self._number("MPC_LAND_SPEED"))
         if self._mode is Mode.RETURN:
             return self._return(p, v, dt_s)
         if self._mode is Mode.ALTITUDE:
@@ -273,8 +274,8 @@ class Guidance:
 
     def _landing_speed(self, p: Vec3) -> float:
         """Give the speed of a descent to home's height: fast while high."""
-        high = self.home[2] - p[2] > self._parameters.number("RTL_DESCEND_ALT")
-        return self._parameters.number("MPC_Z_VEL_MAX_DN" if high else "MPC_LAND_SPEED")
+        high = self.home[2] - p[2] > self._number("RTL_DESCEND_ALT")
+        return self._number("MPC_Z_VEL_MAX_DN" if high else "MPC_LAND_SPEED")
 
     def _turn(self, yaw: float, dt_s: float) -> None:
         """Turn the heading towards `yaw` [rad]; NaN, or what is no direction: it stays."""
@@ -288,12 +289,12 @@ class Guidance:
         """Climb straight up: a ramp of the speed, then a slower approach to the height."""
         assert self._anchor is not None
         self._ramp_s += dt_s
-        ramp = min(1.0, self._ramp_s / max(self._parameters.number("MPC_TKO_RAMP_T"), 1e-3))
+        ramp = min(1.0, self._ramp_s / max(self._number("MPC_TKO_RAMP_T"), 1e-3))
         remaining = p[2] - self._takeoff_d
         if remaining < _NEAR_M and abs(v[2]) < _STOPPED_M_S:
             self.takeoff_done = True
             return PositionSetpoint(self._anchor, _NOTHING, _NOTHING, self._yaw, 0.0)
-        speed = min(self._parameters.number("MPC_TKO_SPEED") * ramp, self._parameters.number("MPC_Z_P") * remaining)
+        speed = min(self._number("MPC_TKO_SPEED") * ramp, self._number("MPC_Z_P") * remaining)
         horizontal = (self._anchor[0], self._anchor[1], math.nan)
         return PositionSetpoint(horizontal, (math.nan, math.nan, -speed), _NOTHING, self._yaw, 0.0)
 
@@ -335,13 +336,17 @@ class Guidance:
         north, east, down = target[0] - p[0], target[1] - p[1], target[2] - p[2]
         distance = math.hypot(north, east)
         asked = self.mission.speed_m_s if self._mode is Mode.MISSION else None
-        asked = asked or self.speed_m_s or self._parameters.number("MPC_XY_CRUISE")
-        cruise = min(asked, self._parameters.number("MPC_XY_VEL_MAX"), self._parameters.number("MPC_XY_P") * distance)
+        asked = asked or self.speed_m_s or self._number("MPC_XY_CRUISE")
+        cruise = min(asked, self._number("MPC_XY_VEL_MAX"), self._number("MPC_XY_P") * distance)
         share = cruise / distance if distance > 0.0 else 0.0
-        vertical = self._parameters.number("MPC_Z_P") * down
-        vertical = max(vertical, -self._parameters.number("MPC_Z_VEL_MAX_UP"))
-        vertical = min(vertical, self._parameters.number("MPC_Z_VEL_MAX_DN"))
+        vertical = self._number("MPC_Z_P") * down
+        vertical = max(vertical, -self._number("MPC_Z_VEL_MAX_UP"))
+        vertical = min(vertical, self._number("MPC_Z_VEL_MAX_DN"))
         self._slew((share * north, share * east, vertical), dt_s)
+
+    def _number(self, name: str) -> float:
+        """Give a parameter as a length, speed or gain that can be reckoned with, whatever somebody has set it to."""
+        return self._parameters.within(name, 0.0, _NUMBER_MAX)
 
     def _slew(self, wanted: Vec3, dt_s: float) -> None:
         """Move the velocity setpoint towards `wanted` within the acceleration limits."""

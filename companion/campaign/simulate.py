@@ -291,6 +291,7 @@ def _ideal_row(sample: ideal.Sample, ref: Reference, course: Course, parameters:
         )
         + (sample.evaluation.heading_error, *e.e1, *e.e2, *e.e3, *e.e4, lyapunov(e, parameters.gains.p_max), *c.b_hat)
         + (c.thrust, c.thrust_rate, *sample.evaluation.tau, *s.w, math.nan, math.nan, math.nan, 0.0, 0.0, 0.0)
+        + (*s.q, *s.w)
     )
 
 

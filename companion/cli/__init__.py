@@ -22,6 +22,7 @@ from companion.errors import CompanionError, ExitCode
 COMMANDS = {
     "demo": "Fly the paper's figure of eight on the bundled vehicle.",
     "fly": "Fly a trajectory on a vehicle that is already there.",
+    "check": "Check that trajectories can be flown: continuity, limits, margins.",
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
     "report": "Build report.html of a flight folder again.",

@@ -47,5 +47,5 @@ def control_row(
         + (*reference.p, *reference.v, *error, n[flat.HEADING_ERROR], *n[flat.ERRORS], n[flat.LYAPUNOV])
         + (*n[flat.B_HAT], n[flat.TOTAL], n[flat.TOTAL_RATE], *n[flat.TAU], *n[flat.RATES])
         + (thrust_of(out.setpoint), timing.age_ms, timing.took_us, float(timing.late), float(timing.skipped))
-        + (n[flat.LIMITS],)
+        + (n[flat.LIMITS], *n[flat.PREDICTED_Q], *n[flat.PREDICTED_W])
     )

@@ -42,6 +42,9 @@ COLUMNS: Final[tuple[str, ...]] = (
     "late",  # wall: 1 when that took more than 20 % of the state period
     "skipped",  # states that were skipped before this one
     "limits",  # bit mask of LIMIT_*
+    # The state predicted to the time at which the command takes effect.
+    *("predicted_q_w", "predicted_q_x", "predicted_q_y", "predicted_q_z"),
+    *("predicted_w_x", "predicted_w_y", "predicted_w_z"),  # rad/s
 )
 """Names of the columns, in the order of a row."""
 

@@ -166,10 +166,10 @@ class FlightLog:
         row = _ROW.unpack(content)
         t_us = round(row[_T_S] * 1e6)
         self._mark_gap(t_us)
-        yaw = wrap_angle(yaw_from_quat(row[_Q]) - row[_HEADING_ERROR])  # type: ignore[arg-type]
+        yaw = yaw_from_quat(row[_Q]) - row[_HEADING_ERROR]  # type: ignore[arg-type]
         if self._envelope is None:
             self._envelope = envelope(self._settings, row[_LYAPUNOV], row[_B_HAT])
-        numbers = (*row, yaw, self._envelope)
+        numbers = (*row, wrap_angle(yaw) if math.isfinite(yaw) else math.nan, self._envelope)
         for series, values in self._steps:
             self._out.append(series.encode(t_us, values(numbers)))
 

@@ -2,8 +2,8 @@
 
 Entries are handed over without a system call, so that recording costs the control loop about a microsecond, and what
 was handed over outlives the writer: the reader still has the memory when the writer was killed. An entry that finds no
-room is refused. Each side owns one number of the head: the writer how far it has written, the reader how far it has
-read, both counted in bytes since the start.
+room is refused. Each side owns its numbers of the head: the writer how far it has written and what it refused, the
+reader how far it has read, counted in bytes since the start.
 
 A reader on another core may see the writer's number before the bytes (processors with weak ordering do that), so it
 takes an entry only when it has already seen it announced at an earlier look; `take_rest` is for when the writer has
@@ -23,7 +23,7 @@ _ENTRY = struct.Struct("=qIB")  # wall_ns, length, kind
 _SKIP: Final = 0xFFFFFFFF
 """A length that says: the next entry is at the beginning again."""
 _HEAD_BYTES: Final = 64
-_WRITTEN, _READ, _TAKEN = 0, 1, 2  # the head's numbers, of 8 bytes each
+_WRITTEN, _READ, _TAKEN, _REFUSED = 0, 1, 2, 3  # the head's numbers, of 8 bytes each
 
 
 class Entry(NamedTuple):
@@ -60,6 +60,11 @@ class _Ring:
         """Entries that the reader has taken."""
         return self._numbers[_TAKEN]
 
+    @property
+    def refused(self) -> int:
+        """Entries that found no room."""
+        return self._numbers[_REFUSED]
+
 
 class RingWriter(_Ring):
     """The writing side. Touches all memory at the start: no page fault waits for it later."""
@@ -74,7 +79,7 @@ class RingWriter(_Ring):
         self.put_count = 0
         """Entries put so far."""
 
-    def put(self, kind: int, content: bytes, wall_ns: int) -> bool:
+    def put(self, kind: int, content: bytes | memoryview, wall_ns: int) -> bool:
         """Hand over an entry; False when there is no room for it. Never waits.
 
         Args:
@@ -87,6 +92,7 @@ class RingWriter(_Ring):
         if at + length > self._size:
             skipped = self._size - at
         if self._written + skipped + length - self._numbers[_READ] > self._size:
+            self._numbers[_REFUSED] += 1
             return False
         if skipped:
             if skipped >= _ENTRY.size:

@@ -19,7 +19,7 @@ def counting(rows: int, capacity: int) -> FlightRecord:
 
 
 def test_columns_are_distinct_and_limits_are_single_bits():
-    assert len(set(COLUMNS)) == len(COLUMNS) == 56
+    assert len(set(COLUMNS)) == len(COLUMNS) == 63
     assert COLUMNS[:3] == ("t_s", "track_s", "phase")
     assert COLUMNS[-5:] == ("state_age_ms", "step_us", "late", "skipped", "limits")
     assert list(LIMIT_NAMES) == [1, 2, 4, 8, 16, 32, 64]
@@ -28,7 +28,7 @@ def test_columns_are_distinct_and_limits_are_single_bits():
 def test_rows_come_back_by_column():
     record = counting(3, 10)
     assert len(record) == 3
-    assert record.rows.shape == (3, 56)
+    assert record.rows.shape == (3, 63)
     assert record.column("t_s").tolist() == [0.0, 1.0, 2.0]
     assert record.column("limits").tolist() == [0.55, 1.55, 2.55]
     assert record.columns("p_d", "t_s")[2].tolist() == [2 + COLUMN_INDEX["p_d"] / 100, 2.0]

@@ -16,7 +16,7 @@ from companion.trajectory.pieces import chain, sample
 from companion.trajectory.shapes import Circle, Hover, Lemniscate
 
 # Gentle for any multirotor that flies outdoors.
-LIMITS = ReferenceLimits(5.0, 3.0, 0.5, 9.0, 80.0, 2.0)
+LIMITS = ReferenceLimits(5.0, 3.2, 0.5, 9.0, 80.0, 2.0)
 MODEL = PointMass(4.76, 0.2)
 BUNDLED = ["circle", "helix", "hover", "indoor", "line", "lissajous", "paper", "windtest"]
 

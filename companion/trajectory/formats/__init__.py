@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from companion.frames import FRAMES, Frame
+from companion.trajectory.fence import Fence
 from companion.trajectory.formats import (
     mavsdk_csv,
     plan,
@@ -96,6 +97,24 @@ def parse(source: Source, *, frame: Frame | None = None, name: str | None = None
         raise source.fault(None, "holds numbers that are too large") from None
 
 
+def read_fence(path: Path) -> Fence:
+    """Return the geofence of a mission file, which need not have a mission, in north-east-down from its home.
+
+    Raises:
+        InputError: it is of another format, has no fence, or does not say where home is.
+
+    """
+    source = read_source(path)
+    chosen = recognise(source, path.suffix)
+    reader = {"qgc-plan": plan.read_fence, "qgc-wpl": wpl.read_fence}.get(chosen.name)
+    if reader is None:
+        raise source.fault(None, f"a {chosen.title} file has no geofence; a QGroundControl plan can")
+    found = reader(source)
+    if found is None:
+        raise source.fault(None, "has no geofence, or no home position to count it from")
+    return found
+
+
 def recognise(source: Source, suffix: str = "") -> Format:
     """Return the format of a text. Raises InputError, with what the text begins with and what the suffix says."""
     for entry in FORMATS:
@@ -133,4 +152,4 @@ def _frame(source: Source, chosen: Format, declared: Frame | None) -> Frame:
     return found
 
 
-__all__ = ["FORMATS", "NAMES", "Format", "parse", "read", "recognise"]
+__all__ = ["FORMATS", "NAMES", "Format", "parse", "read", "read_fence", "recognise"]

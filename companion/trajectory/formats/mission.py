@@ -41,6 +41,10 @@ EXTENT_MAX_M = 20e3
 HOLD_MAX_S = 3600.0
 
 
+GeoFence = tuple[list[GeoPoint], bool] | tuple[GeoPoint, float, bool]
+"""A polygon (corners, inclusion) or a circle (centre, radius [m], inclusion)."""
+
+
 class Item(NamedTuple):
     """One mission item; None where the value is not set (NaN in MAVLink, null in plans)."""
 
@@ -175,7 +179,7 @@ def route(
     home: GeoPoint | None,
     *,
     speed_max_m_s: float | None = None,
-    fence: Sequence[tuple[list[GeoPoint], bool] | tuple[GeoPoint, float, bool]] = (),
+    fence: Sequence[GeoFence] = (),
 ) -> Route:
     """Return the points that a mission flies through, relative to its origin, NED.
 
@@ -185,7 +189,7 @@ def route(
         home: the place that the file calls home, altitude above mean sea level; the origin of the coordinates. Without
             one the first point is the origin.
         speed_max_m_s: what the file asks for at most.
-        fence: polygons (corners, inclusion) and circles (centre, radius [m], inclusion).
+        fence: of the mission.
 
     Raises:
         InputError: an item cannot be flown so, or there are fewer than two points.
@@ -215,7 +219,7 @@ def route(
         speed_max_m_s=slowest,
         origin=origin,
         altitude_above_home=above_home,
-        fence=_local_fence(fence, origin),
+        fence=local_fence(fence, origin),
         notes=tuple(walk.notes),
     )
 
@@ -257,9 +261,8 @@ def _legs(walk: _Walk, origin: GeoPoint) -> list[Leg]:
     return legs
 
 
-def _local_fence(
-    fence: Sequence[tuple[list[GeoPoint], bool] | tuple[GeoPoint, float, bool]], origin: GeoPoint
-) -> Fence | None:
+def local_fence(fence: Sequence[GeoFence], origin: GeoPoint) -> Fence | None:
+    """Return fences in north-east-down from an origin; None when there are none."""
     parts: list[Polygon | Circle] = []
     for part in fence:
         if len(part) == 3:
@@ -271,16 +274,14 @@ def _local_fence(
     return Fence(tuple(parts)) if parts else None
 
 
-def fence_items(
-    source: Source, items: Sequence[Item]
-) -> list[tuple[list[GeoPoint], bool] | tuple[GeoPoint, float, bool]]:
+def fence_items(source: Source, items: Sequence[Item]) -> list[GeoFence]:
     """Return the fences among mission items: vertices (param1: how many the polygon has) and circles (param1: radius).
 
     Raises:
         InputError: a polygon's vertices do not follow each other, or a figure makes no sense.
 
     """
-    found: list[tuple[list[GeoPoint], bool] | tuple[GeoPoint, float, bool]] = []
+    found: list[GeoFence] = []
     corners: list[GeoPoint] = []
     for item in items:
         vertex = item.command in (POLYGON_INCLUSION, POLYGON_EXCLUSION)

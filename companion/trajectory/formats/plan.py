@@ -9,8 +9,9 @@ from typing import Any, NoReturn
 
 from companion.errors import InputError
 from companion.frames import Frame, GeoPoint
+from companion.trajectory.fence import Fence
 from companion.trajectory.formats.contents import Route
-from companion.trajectory.formats.mission import ITEMS_MAX, Item, route
+from companion.trajectory.formats.mission import ITEMS_MAX, GeoFence, Item, local_fence, route
 from companion.trajectory.formats.reading import SPEED_MAX_M_S, Source, quoted
 
 PARAMETERS = 7
@@ -45,6 +46,14 @@ def read(source: Source, frame: Frame) -> Route:
         speed_max_m_s=speed_max_m_s,
         fence=list(reader.fence(plan.get("geoFence"))),
     )
+
+
+def read_fence(source: Source) -> Fence | None:
+    """Return the geofence alone, from the planned home; None without one or the other. Raises InputError."""
+    reader = _Reader(source)
+    plan = reader.table(reader.parsed(), "the file")
+    home = reader.home(reader.table(plan.get("mission"), "mission").get("plannedHomePosition"))
+    return None if home is None else local_fence(list(reader.fence(plan.get("geoFence"))), home)
 
 
 class _Reader:
@@ -143,7 +152,7 @@ class _Reader:
         frame = self.whole(item.get("frame"), f"{where}.frame")
         return Item(None, where, command, frame, values[0], values[1], values[3], values[4], values[5], values[6])
 
-    def fence(self, value: Any) -> Iterator[tuple[list[GeoPoint], bool] | tuple[GeoPoint, float, bool]]:
+    def fence(self, value: Any) -> Iterator[GeoFence]:
         """Take the fences."""
         if value is None:
             return

@@ -6,8 +6,9 @@ Where the first item is absolute while it is also the current one, it is the hom
 from __future__ import annotations
 
 from companion.frames import Frame, GeoPoint
+from companion.trajectory.fence import Fence
 from companion.trajectory.formats.contents import Route
-from companion.trajectory.formats.mission import TAKEOFF, WAYPOINT, Item, fence_items, route
+from companion.trajectory.formats.mission import TAKEOFF, WAYPOINT, Item, fence_items, local_fence, route
 from companion.trajectory.formats.reading import Row, Source, first_line, lines_of, number
 
 COLUMNS = ("index", "current", "frame", "command", "p1", "p2", "p3", "p4", "x", "y", "z", "autocontinue")
@@ -23,6 +24,18 @@ def matches(source: Source) -> bool:
 
 def read(source: Source, frame: Frame) -> Route:
     """Return the points of a mission, in north-east-down from its home. Raises InputError."""
+    items, home = _items(source)
+    return route(source, items if home is None else items[1:], home, fence=fence_items(source, items))
+
+
+def read_fence(source: Source) -> Fence | None:
+    """Return the geofence alone, from home; None without one or the other. Raises InputError."""
+    items, home = _items(source)
+    return None if home is None else local_fence(fence_items(source, items), home)
+
+
+def _items(source: Source) -> tuple[list[Item], GeoPoint | None]:
+    """Return all items, the home position among them, and what it is."""
     line, text = first_line(source)
     if text.split() != [*SIGNATURE.split(), VERSION]:
         raise source.fault(line, f"the first line must be {SIGNATURE} {VERSION}")
@@ -36,9 +49,7 @@ def read(source: Source, frame: Frame) -> Route:
         rows.append((Row(at, tuple(0.0 if value is None else value for value in values)), values))
     if not rows:
         raise source.fault(line, "has no items")
-    items = [_item(source, row, values) for row, values in rows]
-    home = _home(rows[0][0])
-    return route(source, items if home is None else items[1:], home, fence=fence_items(source, items))
+    return [_item(source, row, values) for row, values in rows], _home(rows[0][0])
 
 
 def _value(source: Source, line: int, cell: str, name: str) -> float | None:
