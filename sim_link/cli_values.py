@@ -33,6 +33,7 @@ class Stop:
         self._wanted = True
 
     def __call__(self) -> bool:
+        """Tell whether to stop."""
         return self._wanted or (self._parent is not None and os.getppid() != self._parent)
 
 

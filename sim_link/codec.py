@@ -10,6 +10,7 @@ Not shared with the companion on purpose: an error in one codec must not cancel 
 from __future__ import annotations
 
 import os
+import re
 import struct
 from typing import Any, NamedTuple
 
@@ -38,6 +39,9 @@ __all__ = [
 
 MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD
+_MAGIC = re.compile(b"[\xfd\xfe]")
+_FALSE_STARTS_MAX = 32
+"""In one datagram: to look for messages in nonsense takes time, and a flood of it must cost little."""
 SIGNED_FLAG = 0x01
 SIGNATURE_LENGTH = 13
 AUTOPILOT_COMPONENT = 1
@@ -118,7 +122,10 @@ class ActuatorControls(NamedTuple):
 
 
 def frames(datagram: bytes) -> list[Frame]:
-    """Give every valid MAVLink message in `datagram`; whatever is no message, or fails its checksum, is passed over."""
+    """Give every valid MAVLink message in `datagram`; whatever is no message, or fails its checksum, is passed over.
+
+    After too many beginnings of a message that is none, so is the rest of the datagram.
+    """
     found: list[Frame] = []
     at = 0
     end = len(datagram)
@@ -129,12 +136,14 @@ def frames(datagram: bytes) -> list[Frame]:
         known = _CHECKED.get(msg_id)
         if known is not None and mcrf4xx(datagram[1:-2] + known[0]) == datagram[-2] | datagram[-1] << 8:
             return [Frame(msg_id, system, component, datagram[10:-2], datagram)]
-    while at < end:
-        magic = datagram[at]
-        length = 0
-        if magic in (MAGIC_V2, MAGIC_V1):
-            length = _frame_at(datagram, at, end, found)
-        at += length if length > 0 else 1
+    false_starts = 0
+    while at < end and false_starts <= _FALSE_STARTS_MAX:
+        start = _MAGIC.search(datagram, at)
+        if start is None:
+            break
+        length = _frame_at(datagram, start.start(), end, found)
+        false_starts += length == 0
+        at = start.start() + max(length, 1)
     return found
 
 

@@ -32,8 +32,10 @@ def find(name_or_path: str) -> Path:
     raise FaultError("", f"{name_or_path}: no such fault file, and not one of the bundled ones ({names})")
 
 
-def load(name_or_path: str, px4: str = "1.18") -> tuple[Fault, ...]:
-    """Read and check a fault file for a version of PX4: a path first, then a bundled name such as "windy_link".
+def load(name_or_path: str, *px4: str) -> tuple[Fault, ...]:
+    """Read and check a fault file: a path first, then a bundled name such as "windy_link".
+
+    `px4`: it must be right for one of these versions at least; without any, parameters are not looked at.
 
     Raises:
         FaultError: there is none, or it cannot be; with the path of the key.
@@ -46,10 +48,16 @@ def load(name_or_path: str, px4: str = "1.18") -> tuple[Fault, ...]:
     except tomllib.TOMLDecodeError as error:
         raise FaultError("", f"{path}: not valid TOML: {error}") from error
     faults = parse(document, str(path))
-    try:
-        check_parameters(faults, px4)
-    except FaultError as error:
-        raise FaultError(f"{path}: {error.key}", error.sentence) from None
+    refused: FaultError | None = None
+    for version in px4:
+        try:
+            check_parameters(faults, version)
+        except FaultError as error:
+            refused = refused or FaultError(f"{path}: {error.key}", error.sentence)
+        else:
+            return faults
+    if refused is not None:
+        raise refused
     return faults
 
 

@@ -140,9 +140,14 @@ def collide(a: Fault, b: Fault) -> bool:
     return a.kind != b.kind or first.collides(a.values, b.values)
 
 
-def check_together(faults: Sequence[Fault], name: Callable[[int], str] = lambda i: f"fault[{i}]") -> None:
-    """Raise FaultError when two of the faults collide; `name` gives what to call the one of an index."""
-    for i, late in enumerate(faults):
+def check_together(
+    faults: Sequence[Fault], name: Callable[[int], str] = lambda i: f"fault[{i}]", *, first: int = 0
+) -> None:
+    """Raise FaultError when two of the faults collide.
+
+    `name` gives what to call the one of an index; those before `first` are known not to collide with one another.
+    """
+    for i, late in enumerate(faults[first:], first):
         for j, early in enumerate(faults[:i]):
             if collide(early, late):
                 raise FaultError(

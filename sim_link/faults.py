@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from .vehicle import Vehicle
 
 LOG_COLUMNS = ("t_s", "number", "event", "fault", "remark")
+AT_ONCE_MAX, ALL_MAX = 200, 10_000
+"""Of the faults that are ordered: more of them would take the vehicle's time."""
 _NEVER_US = 1 << 62
 _BEGIN, _END = 1, 0
 """At the same time what ends does so first."""
@@ -63,7 +65,7 @@ class Faults:
         self._events: list[tuple[int, int, int]] = []
         """Heap of time [us], begin or end, number."""
         self._again_us = _NEVER_US
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._log_path: Path | None = None
         self._log: TextIO | None = None
         self._failures: dict[tuple[int, int], int] = {}
@@ -106,8 +108,12 @@ class Faults:
             except FaultError as error:
                 raise FaultError(error.key.removeprefix("fault[0]."), error.sentence) from None
             left = [number for number in range(len(self._all)) if number not in self._over]
+            if len(left) >= AT_ONCE_MAX or len(self._all) >= ALL_MAX:
+                raise FaultError("", f"too many faults: {AT_ONCE_MAX} can act or wait, and {ALL_MAX} be in all")
             numbers = [*left, len(self._all)]
-            check_together([*(self._all[n] for n in left), fault], lambda index: f"fault {numbers[index]}")
+            check_together(
+                [*(self._all[n] for n in left), fault], lambda index: f"fault {numbers[index]}", first=len(left)
+            )
             return self._plan(fault)
 
     def inject(

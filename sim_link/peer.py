@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from .codec import ID_SERIAL_CONTROL, ID_TIMESYNC, TIMESYNC, Frame, timesync
 from .fault_shell import FaultShell
+from .intake import Intake, allowance
 from .link import Link
 from .truth_log import TruthLog, row
 from .udp import Address, UdpEndpoint
@@ -33,6 +34,8 @@ _SPIN_NEXT_S = 3.0e-5
 """The same once something of the companion has come: the rest follows closely."""
 _SPIN_REST_MAX = 127
 """States for which it sleeps at once after polling was in vain time and again: the companion needs the processor."""
+_AT_ONCE = 64
+"""Of the companion's datagrams so many are acted on in lockstep before the clock and `stopped` are looked at."""
 _LATE_MAX_S = 0.25
 """Of lateness so much is caught up with; the rest is let go."""
 
@@ -116,6 +119,10 @@ class Peer:
         self._poll = select.poll()
         for endpoint in self._endpoints:
             self._poll.register(endpoint.fileno(), select.POLLIN)
+        per_state = allowance(vehicle.period_us * 1e-6 / self._speed)
+        self._intakes = [Intake(endpoint, per_state) for endpoint in self._endpoints]
+        self._muted: list[int] = []
+        """Sockets whose allowance is used up: nobody waits for them before the next state."""
         self._waiting: deque[tuple[list[Frame], Address]] = deque()
         self._spin_vain = 0
         """States for which sleeping at once is the better choice, when polling was in vain last."""
@@ -144,7 +151,18 @@ class Peer:
 
     def step(self) -> None:
         """Advance by one state: move, send, then wait as the kind of time asks, acting on what is received."""
-        vehicle, log = self.vehicle, self._truth_log
+        text = self._advance()
+        over = True
+        if self.synchronous:
+            over = self._wait_for_answer()
+        else:
+            self._wait_for_time()
+        if text and over:
+            self._log_row(text)
+
+    def _advance(self) -> str:
+        """Move by one state period and send; gives the state's row for the truth file, if there is one."""
+        vehicle = self.vehicle
         vehicle.tick(self._send_state)
         if vehicle.truth_outbox:
             self._flush()
@@ -154,14 +172,13 @@ class Peer:
                     self._obey(frame, link)
         # The companion is at work now: what else there is to do costs nobody any time.
         vehicle.look_ahead()
-        text = "" if log is None else row(vehicle.airframe.truth())
-        over = True
-        if self.synchronous:
-            over = self._wait_for_answer()
-        else:
-            self._wait_for_time()
-        if log is not None and over:
-            log.add(text)
+        self._refill()
+        return "" if self._truth_log is None else row(vehicle.airframe.truth())
+
+    def _log_row(self, text: str) -> None:
+        """Write a row of the truth file."""
+        if self._truth_log is not None:
+            self._truth_log.add(text)
 
     def _send_state(self, t_us: int) -> None:
         """Send the messages of a state; in lockstep ask for the companion's answer to it."""
@@ -194,7 +211,8 @@ class Peer:
                 self._flush()
             timeout_s = max(0.0, min(_SLICE_S, next_heartbeat_s - now_s))
             if self._poll.poll(timeout_s * 1e3):
-                self._serve_ground()
+                self._refill()
+                self._hear_ground()
                 datagram = self.companion.receive()
                 if datagram is not None and datagram[0]:
                     if datagram[0][0].msg_id == ID_SERIAL_CONTROL:
@@ -250,73 +268,129 @@ class Peer:
             datagram = receive()
             if datagram is not None:
                 self._act(*datagram)
-                end_s = min(max(end_s, clock() + _SPIN_NEXT_S), give_up_s)
-            elif clock() > end_s:
+                now_s = clock()
+                end_s = min(max(end_s, now_s + _SPIN_NEXT_S), give_up_s)
+            else:
+                now_s = clock()
+            if now_s > end_s:
                 return
 
     def _wait_for_time(self) -> None:
         """Act on what comes until the wall clock has caught up with the vehicle's."""
-        speed = 1.0 if self.options.lockstep else self.options.speed
-        self._deadline_s += self.vehicle.period_us * 1e-6 / speed
-        now_s = time.monotonic()
-        if now_s - self._deadline_s > _LATE_MAX_S:
-            self._deadline_s = now_s
+        self._set_deadline()
         self._serve(0.0)
         while True:
             self._flush()
             if self._answered:
-                self.synchronous = True
-                self._notice("the companion answers again: back in lockstep")
+                self._return_to_lockstep()
                 return
             left_s = self._deadline_s - time.monotonic()
             if left_s <= 0.0 or self._stopped():
                 return
             self._serve(min(left_s, _SLICE_S))
 
+    def _set_deadline(self) -> None:
+        """Set the time of the next state; lateness beyond a limit is let go."""
+        self._deadline_s += self.vehicle.period_us * 1e-6 / self._speed
+        now_s = time.monotonic()
+        if now_s - self._deadline_s > _LATE_MAX_S:
+            self._deadline_s = now_s
+
+    def _return_to_lockstep(self) -> None:
+        """Let the clock wait for the companion again; what it has sent after its answer belongs to the next state."""
+        self.synchronous = True
+        left = self._intakes[0].take_pending()
+        if left is not None:
+            self._waiting.append(left)
+        self._notice("the companion answers again: back in lockstep")
+
+    @property
+    def _speed(self) -> float:
+        """Vehicle time per wall time, while no companion moves the clock."""
+        return 1.0 if self.options.lockstep else self.options.speed
+
     def _serve(self, timeout_s: float) -> None:
         """Wait until something is received, and act on it."""
         for descriptor, _ in self._poll.poll(max(0.0, timeout_s) * 1e3):
             if descriptor == self.companion.fileno():
-                self._read_companion()
+                self._hear_companion()
             else:
-                self._serve_ground()
+                self._hear_ground()
 
     # Receiving and sending
 
-    def _read_companion(self) -> None:
-        """Act on the companion's datagrams: all that are there, but in lockstep none beyond the answer."""
+    def _refill(self) -> None:
+        """Let every socket be heard anew: a new state has begun."""
+        for intake in self._intakes:
+            intake.refill()
+        for descriptor in self._muted:
+            self._poll.register(descriptor, select.POLLIN)
+        self._muted.clear()
+
+    def _mute_if_used_up(self, intake: Intake, endpoint: UdpEndpoint) -> None:
+        """Do not wait for a socket any more whose allowance is used up."""
+        if intake.used_up and endpoint.fileno() not in self._muted:
+            self._poll.unregister(endpoint.fileno())
+            self._muted.append(endpoint.fileno())
+
+    def _hear_companion(self) -> None:
+        """Act on what the companion has sent: in lockstep up to its answer, else as far as the allowance goes."""
+        if self.synchronous:
+            self._hear_until_answer()
+            return
+        intake, link = self._intakes[0], self.vehicle.companion
         while not (self._answered and self.options.lockstep):
-            datagram = self.companion.receive()
+            heard = intake.next(link.faults)
+            if heard is None:
+                break
+            intake.left -= self._take(*heard)
+        self._mute_if_used_up(intake, self.companion)
+
+    def _hear_until_answer(self) -> None:
+        """Act on the companion's datagrams, but none beyond its answer: those belong to the next state."""
+        for _ in range(_AT_ONCE):
+            datagram = None if self._answered else self.companion.receive()
             if datagram is None:
                 return
             self._act(*datagram)
 
     def _act(self, found: list[Frame], sender: Address) -> None:
-        """Act on the messages of one datagram."""
+        """Act on the messages of one datagram of the companion."""
         link = self.vehicle.companion
-        if link.faults is not None:
-            found = link.faults.incoming(found)
-        for frame in found:
-            if frame.msg_id == ID_TIMESYNC:
-                self._timesync(frame, link, sender == self.companion.partner)
-            elif frame.msg_id == ID_SERIAL_CONTROL:
-                self.companion.answer(self._shell.take(frame, sender), sender)
-            else:
-                self.vehicle.receive(frame, link)
+        for frame in found if link.faults is None else link.faults.incoming(found):
+            self._take(frame, sender)
 
-    def _serve_ground(self) -> None:
-        """Act on what the ground link has received."""
+    def _take(self, frame: Frame, sender: Address) -> int:
+        """Act on a message of the companion; gives how many answer it."""
+        link = self.vehicle.companion
+        if frame.msg_id == ID_SERIAL_CONTROL:
+            answers = self._shell.take(frame, sender)
+            self.companion.answer(answers, sender)
+            return len(answers)
+        queued = len(link.outbox)
+        if frame.msg_id == ID_TIMESYNC:
+            self._timesync(frame, link, sender == self.companion.partner)
+        else:
+            self.vehicle.receive(frame, link)
+        return len(link.outbox) - queued
+
+    def _hear_ground(self) -> None:
+        """Act on what the ground link has received, as far as the allowance goes."""
         if self.ground is None:
             return
-        link = self.vehicle.ground
-        while (datagram := self.ground.receive()) is not None:
-            found, sender = datagram
-            for frame in found if link.faults is None else link.faults.incoming(found):
-                if frame.msg_id == ID_SERIAL_CONTROL:
-                    self.ground.answer(self._shell.take(frame, sender), sender)
-                    continue
-                link.speak()
-                self._obey(frame, link)
+        intake, link = self._intakes[1], self.vehicle.ground
+        while (heard := intake.next(link.faults)) is not None:
+            frame, sender = heard
+            if frame.msg_id == ID_SERIAL_CONTROL:
+                answers = self._shell.take(frame, sender)
+                self.ground.answer(answers, sender)
+                intake.left -= len(answers)
+                continue
+            link.speak()
+            queued = len(link.outbox)
+            self._obey(frame, link)
+            intake.left -= len(link.outbox) - queued
+        self._mute_if_used_up(intake, self.ground)
 
     def _obey(self, frame: Frame, link: Link) -> None:
         """Act on a message that is neither an order of faults nor part of the lockstep exchange."""

@@ -19,6 +19,8 @@ from .rotation import Quat, Vec3, clip, cross, dot, norm, yaw_of
 
 _GRAVITY_M_S2 = 9.80665
 """What PX4's hover thrust stands for."""
+_INTEGRAL_MAX_M_S2 = 1.0e6
+"""Keeps finite what gains that nobody should set let diverge."""
 _TINY = 1.0e-9
 
 
@@ -227,7 +229,9 @@ def _new_integral(
         ey -= back * (a[1] - made_y)
     gain = parameters.MPC_XY_VEL_I_ACC * dt_s
     z = integral[2] + ez * parameters.MPC_Z_VEL_I_ACC * dt_s
-    return (integral[0] + ex * gain, integral[1] + ey * gain, clip(z, -_GRAVITY_M_S2, _GRAVITY_M_S2))
+    x = clip(integral[0] + ex * gain, -_INTEGRAL_MAX_M_S2, _INTEGRAL_MAX_M_S2)
+    y = clip(integral[1] + ey * gain, -_INTEGRAL_MAX_M_S2, _INTEGRAL_MAX_M_S2)
+    return (x, y, clip(z, -_GRAVITY_M_S2, _GRAVITY_M_S2))
 
 
 def position_control(

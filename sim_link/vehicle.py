@@ -45,6 +45,8 @@ _STANDARD_G = 9.80665
 _CONTROL_PERIOD_S = 0.01
 """The autopilot's own loops run at least this often, however slow the state messages are (PX4: 100 Hz and faster)."""
 _PARAMETERS_PER_S = 2000
+_TEXTS_MAX = 8
+"""Sentences of one state that are sent: a flood of requests that are refused must not become one of texts."""
 _TRUTH_PERIOD_US = 40_000
 
 
@@ -322,8 +324,8 @@ class Vehicle:
             link.send(content)
 
     def _publish_texts(self) -> None:
-        """Queue the autopilot's sentences on every link."""
-        for severity, sentence in self.autopilot.texts:
+        """Queue the autopilot's sentences on every link; of too many at once the last are lost, as PX4's are."""
+        for severity, sentence in self.autopilot.texts[:_TEXTS_MAX]:
             self._texts = self._texts % 0xFFFF + 1
             for message in self.telemetry.status_texts(severity, sentence, self._texts):
                 for link in self.links:

@@ -110,6 +110,8 @@ def replay(
         raise InputError(f"{folder}: the record is empty, the flight was never engaged")
     trajectory = of_flight(flight)
     course = Course(trajectory, flight.vehicle, engagement.hold_point_m, engagement.yaw_rad, engagement.home_m)
+    for ramp in engagement.ramps:
+        course.change_pace(ramp)
     tracker = controller_of(flight, engine)
     rows = record.rows
     begin_s = engagement.at_s

@@ -25,7 +25,17 @@ COMMANDS = {
     "check": "Check that trajectories can be flown: continuity, limits, margins.",
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
+    "upload": "Bring a trajectory to the vehicle and get its verdict.",
+    "list": "Show the trajectories on the vehicle.",
+    "remove": "Remove a trajectory from the vehicle.",
     "report": "Build report.html of a flight folder again.",
+    "serve": "Wait on the vehicle for trajectories and commands, and fly.",
+    "start": "Start a trajectory that is on the vehicle.",
+    "pause": "Slow down to rest on the path, and stay there.",
+    "resume": "Go on after a pause.",
+    "stop": "End the flight: to rest on the path, then Hold.",
+    "land": "End the flight and land.",
+    "status": "Show how things stand on the vehicle, live.",
     "replay": "Give a flight's states to the controller again and compare its commands.",
 }
 """Every command with its line in `companion --help`; the module companion.cli.NAME holds it."""

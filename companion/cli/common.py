@@ -134,16 +134,23 @@ def fly_bundled(
 
 
 def fault_file(name: str | None) -> Path | None:
-    """The file of --faults.
+    """The file of --faults, which the bundled vehicle has checked.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or it cannot be.
     """
     if name is None:
         return None
+    import subprocess
+
     from companion.config import find
 
-    return find(name, "faults")
+    path = find(name, "faults")
+    command = [sys.executable, "-m", "sim_link", "fault", "check", str(path)]
+    checked = subprocess.run(command, check=False, capture_output=True, text=True)
+    if checked.returncode != 0:
+        raise InputError(checked.stderr.strip().removeprefix("sim-link: ") or f"{path}: could not be checked")
+    return path
 
 
 def report_flight(flown: Flown, *, as_json: bool) -> int:

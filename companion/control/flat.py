@@ -69,6 +69,12 @@ def controller_numbers(c: ControllerState) -> tuple[float, ...]:
     return (c.thrust, c.thrust_rate, *c.b_hat, *h.r2d, *h.forward, float(h.held), *c.lead_integral)
 
 
+def controller_of_numbers(n: Sequence[float]) -> ControllerState:
+    """The controller's state from what `controller_numbers` gives."""
+    memory = HeadingState((n[5], n[6], n[7]), (n[8], n[9], n[10]), n[11] > 0.5)
+    return ControllerState(n[0], n[1], (n[2], n[3], n[4]), memory, (n[12], n[13], n[14]))
+
+
 def control_step(x: MutableSequence[float], c: Sequence[float], y: MutableSequence[float]) -> None:
     """Predicts the state through the pieces, computes one law step, and replaces the controller's state.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,9 @@ INPUTS = 4
 """Thrust and body rate setpoints."""
 MARGIN_LIMIT_S = 0.3
 INTERVAL_LIMIT_S = 0.5
+DELAY_STRIDE_S = 0.004
+INTERVAL_STRIDE_S = 0.010
+"""Steps of the search for both; the last one is bisected."""
 
 
 class Timing(NamedTuple):
@@ -76,6 +80,45 @@ def _rotation(q: Quat) -> list[float]:
     return [2.0 * math.copysign(1.0, q[0]) * x for x in q[1:]]
 
 
+@lru_cache(maxsize=256)
+def _plant(
+    vehicle: tuple[float, float, float], lags_s: tuple[float, float, float, float], duration_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """See `_Loop.plant`; kept, because it is most of the work and no gain is in it. The arrays cannot be written to."""
+    if duration_s <= 0.0:
+        found = np.eye(PLANT), np.zeros((PLANT, INPUTS)), np.zeros((PLANT, 3))
+    else:
+        found = _plant_over(vehicle, lags_s, duration_s)
+    for array in found:
+        array.flags.writeable = False
+    return found
+
+
+def _plant_over(
+    vehicle: tuple[float, float, float], lags_s: tuple[float, float, float, float], duration_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    pieces = max(1, math.ceil(duration_s / 0.005))
+    piece_s = duration_s / pieces
+    lags = factors(lags_s, piece_s)
+    weight = vehicle[0] * vehicle[1]
+
+    def run(z: FloatArray) -> FloatArray:
+        state, thrust = _state(z), float(z[12])
+        n = z.tolist()
+        for _ in range(pieces):
+            state, thrust = advance(
+                state, thrust, (n[14], n[15], n[16]), n[13], (n[17], n[18], n[19]), vehicle, lags, piece_s
+            )
+        return np.array([*state.p, *state.v, *_rotation(state.q), *state.w, thrust])
+
+    at = np.zeros(20)
+    at[12] = at[13] = weight
+    scales = np.full(20, 1e-5)
+    scales[12] = scales[13] = 1e-4 * weight
+    j = _jacobian(run, at, scales)
+    return j[:, :13], j[:, 13:17], j[:, 17:20]
+
+
 class _Loop:
     """The linearised pieces of one loop."""
 
@@ -94,34 +137,7 @@ class _Loop:
 
     def plant(self, duration_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """F, G, H of x+ = F x + G u + H b_hat over `duration_s` under one command."""
-        if duration_s <= 0.0:
-            return np.eye(PLANT), np.zeros((PLANT, INPUTS)), np.zeros((PLANT, 3))
-        pieces = max(1, math.ceil(duration_s / 0.005))
-        piece_s = duration_s / pieces
-        lags = factors(self.lags, piece_s)
-
-        def run(z: FloatArray) -> FloatArray:
-            state, thrust = _state(z), float(z[12])
-            n = z.tolist()
-            for _ in range(pieces):
-                state, thrust = advance(
-                    state,
-                    thrust,
-                    (n[14], n[15], n[16]),
-                    n[13],
-                    (n[17], n[18], n[19]),
-                    self.vehicle,
-                    lags,
-                    piece_s,
-                )
-            return np.array([*state.p, *state.v, *_rotation(state.q), *state.w, thrust])
-
-        at = np.zeros(20)
-        at[12] = at[13] = self.weight
-        scales = np.full(20, 1e-5)
-        scales[12] = scales[13] = 1e-4 * self.weight
-        j = _jacobian(run, at, scales)
-        return j[:, :13], j[:, 13:17], j[:, 17:20]
+        return _plant(self.vehicle, self.lags, duration_s)
 
     def controller(self, interval_s: float) -> FloatArray:
         """The map (state 12, T, T', b_hat 3) -> (u 4, T, T', b_hat 3); shape (9, 17)."""
@@ -224,17 +240,29 @@ def spectral_radius(parameters: Parameters, timing: Timing, extra_delay_s: float
     return float(np.abs(np.linalg.eigvals(loop_matrix(parameters, timing, extra_delay_s))).max())
 
 
-def margins(parameters: Parameters, timing: Timing) -> Margins:
-    """Delay margin and longest sample interval of a loop; both are 0 when it is unstable as it is."""
+def margins(
+    parameters: Parameters,
+    timing: Timing,
+    delay_limit_s: float = MARGIN_LIMIT_S,
+    interval_limit_s: float = INTERVAL_LIMIT_S,
+) -> Margins:
+    """Delay margin and longest sample interval of a loop; both are 0 when it is unstable as it is.
+
+    Args:
+        parameters: what flies.
+        timing: interval, delay, lags.
+        delay_limit_s: no longer delay is looked at [s]; what is found up to there does not depend on it.
+        interval_limit_s: no longer interval is looked at [s].
+    """
     radius = spectral_radius(parameters, timing)
     if radius >= 1.0:
         return Margins(radius, 0.0, 0.0)
-    delay = _first_failure(lambda x: spectral_radius(parameters, timing, x) < 1.0, 0.0, MARGIN_LIMIT_S, 0.004)
+    delay = _first_failure(lambda x: spectral_radius(parameters, timing, x) < 1.0, 0.0, delay_limit_s, DELAY_STRIDE_S)
     interval = _first_failure(
         lambda x: spectral_radius(parameters, timing._replace(interval_s=x)) < 1.0,
         timing.interval_s,
-        INTERVAL_LIMIT_S,
-        0.01,
+        interval_limit_s,
+        INTERVAL_STRIDE_S,
     )
     return Margins(radius, delay, interval)
 

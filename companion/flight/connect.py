@@ -58,7 +58,7 @@ def find_autopilot(wire: Wire, connection: str, timeout_s: float, interrupted: C
             spoken_ns = wall_ns
             send_heartbeat(wire)
         for frame in wire.receive(WAIT_S):
-            system = _autopilot_system(frame)
+            system = autopilot_system(frame)
             if system is not None:
                 wire.system_id = system
                 send_heartbeat(wire)
@@ -69,7 +69,7 @@ def find_autopilot(wire: Wire, connection: str, timeout_s: float, interrupted: C
                 wire.peer, wire.last_foreign = wire.last_foreign, None
 
 
-def _autopilot_system(frame: Frame) -> int | None:
+def autopilot_system(frame: Frame) -> int | None:
     """The system id of an autopilot whose heartbeat this is.
 
     Raises:

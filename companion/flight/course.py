@@ -7,32 +7,20 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from companion.config import Vehicle
-from companion.control.types import GRAVITY_M_S2, Reference, Vec3
+from companion.control.types import Reference, Vec3
 from companion.errors import RefusedError
+from companion.flight.tempo import Ramp, RampPlan, Tempo
 from companion.trajectory.anchored import Anchored, Trajectory, anchored
 from companion.trajectory.flatness import PointMass, ReferenceLimits, demand
 from companion.trajectory.joins import Join, join, stop
 from companion.trajectory.pieces import Piece, chain
+from companion.trajectory.timing import paced
+from companion.trajectory.vehicle_limits import point_mass, reference_limits
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 GENTLE_ACCELERATION_M_S2 = 2.0
 GENTLE_RATE_RAD_S = 1.0
 """Joins and stops are on the way to and from the flight's task: they need not use what the vehicle can do."""
-
-
-def reference_limits(vehicle: Vehicle) -> ReferenceLimits:
-    """The vehicle's limits as far as they bear on references."""
-    lim = vehicle.limits
-    heading_rate = lim.heading_rate_max_rad_s if vehicle.controller.heading == "commanded" else float("inf")
-    return ReferenceLimits(
-        speed_max_m_s=lim.speed_max_m_s,
-        acceleration_max_m_s2=lim.acceleration_max_m_s2,
-        tilt_max_rad=lim.tilt_max_rad,
-        thrust_min_n=lim.thrust_min_n,
-        thrust_max_n=lim.thrust_max_n,
-        rate_max_rad_s=min(lim.rate_max_rad_s[:2]),
-        heading_rate_max_rad_s=heading_rate,
-    )
 
 
 def gentle(limits: ReferenceLimits, end: Reference, model: PointMass) -> ReferenceLimits:
@@ -55,18 +43,13 @@ def _gently(plan: Callable[[ReferenceLimits], Join], limits: ReferenceLimits, ea
         return plan(limits)
 
 
-def point_mass(vehicle: Vehicle) -> PointMass:
-    """The vehicle as differential flatness sees it."""
-    return PointMass(vehicle.body.mass_kg, vehicle.body.drag_1_s, GRAVITY_M_S2)
-
-
 def at_rest(p: Vec3, yaw_rad: float) -> Reference:
     """A reference that stays where it is."""
     return Reference(p, ZERO, ZERO, ZERO, ZERO, yaw_rad, 0.0, 0.0)
 
 
 class Course:
-    """Join, trajectory and stop; times are seconds from the moment of engaging.
+    """Join, trajectory and stop, and the pace at which they are flown; times are seconds from the moment of engaging.
 
     Args:
         trajectory: what is to be flown.
@@ -83,7 +66,7 @@ class Course:
         self, trajectory: Trajectory, vehicle: Vehicle, hold_point: Vec3, yaw_rad: float, home: Vec3 | None
     ) -> None:
         self.hold_point, self.yaw_rad, self.home = hold_point, yaw_rad, home
-        limits, model = reference_limits(vehicle), point_mass(vehicle)
+        self._limits, self._model = limits, model = reference_limits(vehicle), point_mass(vehicle)
         path: Anchored = anchored(trajectory, hold_point, home)
         pieces: list[Piece] = []
         self.join_s = 0.0
@@ -99,15 +82,66 @@ class Course:
         self.track_s = path.duration_s
         self.stop_s = stopping.duration_s
         self._chain = chain([*pieces, path, stopping])
+        self._tempo = Tempo()
 
     @property
     def duration_s(self) -> float:
-        """Join, trajectory and stop together [s]."""
+        """Join, trajectory and stop together, at their own pace [s]."""
         return self.join_s + self.track_s + self.stop_s
 
     def at(self, t_s: float) -> Reference:
         """The reference, `t_s` after engaging; before 0 the start, after the end the point of rest."""
-        on_track_s = t_s - self.join_s
+        if self._tempo.steady:
+            return self._at_own_pace(t_s)
+        pace = self._tempo.at(t_s)
+        return paced(self._at_own_pace(pace[0]), pace)
+
+    def _at_own_pace(self, course_s: float) -> Reference:
+        on_track_s = course_s - self.join_s
         if 0.0 <= on_track_s <= self.track_s:  # the usual case, without the search for the piece
             return self.path.at(on_track_s)
-        return self._chain.at(t_s)
+        return self._chain.at(course_s)
+
+    # -- pace -----------------------------------------------------------------------------------------------------
+
+    @property
+    def ramps(self) -> tuple[Ramp, ...]:
+        """How the pace was changed so far."""
+        return self._tempo.ramps
+
+    def course_s(self, t_s: float) -> float:
+        """Time on the course [s], `t_s` after engaging."""
+        return self._tempo.at(t_s)[0]
+
+    def resting(self, t_s: float) -> bool:
+        """Whether the pace is zero from now on, until it is changed."""
+        return self._tempo.resting(t_s)
+
+    @property
+    def over_s(self) -> float:
+        """When everything is flown, or the vehicle at rest for good as far as is known [s since engaging]."""
+        tempo = self._tempo
+        settled_s = tempo.settled_s
+        if tempo.resting(settled_s):
+            return settled_s
+        return settled_s + max(0.0, self.duration_s - self.course_s(settled_s))
+
+    def plan_pace(self, begin_s: float, rate: float) -> RampPlan:
+        """Begins to look for a change of pace; see `RampPlan`.
+
+        Args:
+            begin_s: when it is to begin, far enough ahead [s since engaging].
+            rate: 0 to come to rest, 1 to go on.
+        """
+        return RampPlan(self._tempo, _OwnPace(self), begin_s, rate, self._limits, self._model)
+
+    def change_pace(self, ramp: Ramp) -> None:
+        """Takes a change of pace that was planned, or recorded."""
+        self._tempo.add(ramp)
+
+
+class _OwnPace:
+    """A course without its changes of pace."""
+
+    def __init__(self, course: Course) -> None:
+        self.at = course._at_own_pace

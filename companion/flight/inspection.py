@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 from companion.config import Vehicle
 from companion.control.types import Reference, Vec3
 from companion.errors import RefusedError
-from companion.flight.course import Course, point_mass, reference_limits
+from companion.flight.course import Course
 from companion.trajectory import torque
 from companion.trajectory.anchored import Anchored, Trajectory, anchored
+from companion.trajectory.batch import batch, torque_uses
+from companion.trajectory.batch import quantities as array_quantities
 from companion.trajectory.feasibility import USE_TOLERANCE, ViolationName, check, grid, highest
 from companion.trajectory.fence import Fence
 from companion.trajectory.flatness import BOUNDS, PointMass, ReferenceLimits, demand, quantities, worst_use
 from companion.trajectory.shapes import Joint
 from companion.trajectory.timing import scaled
+from companion.trajectory.vehicle_limits import point_mass, reference_limits
 
 ORIGIN: Vec3 = (0.0, 0.0, 0.0)
 HEIGHT_MIN_M = 0.5
@@ -136,7 +139,7 @@ def place_problems(
         height_min_m: what the path must stay above, over home.
     """
     times_s = grid(path)
-    points = np.array([path.at(t_s).p for t_s in times_s])
+    points = batch(path, times_s).p.T
     problems = []
     ground = None if _height_unknown(path.trajectory) else _nearest(times_s, -points[:, 2])
     if ground is not None and not ground.value_m >= height_min_m:
@@ -217,8 +220,8 @@ def inspect(
 def _peaks(path: Anchored, limits: ReferenceLimits, model: PointMass, of: torque.Body) -> tuple[Peak, ...]:
     """Return the extremes of all quantities, found between the samples as well."""
     times_s = grid(path)
-    references = [path.at(t_s) for t_s in times_s]
-    rows = [quantities(reference, model) for reference in references]
+    scan = batch(path, times_s)
+    rows = array_quantities(scan, model)
     found = []
     for index, bound in enumerate(BOUNDS):
         limit: float = getattr(limits, bound.key)
@@ -227,13 +230,13 @@ def _peaks(path: Anchored, limits: ReferenceLimits, model: PointMass, of: torque
         def value(t_s: float, index: int = index, sign: float = sign) -> float:
             return sign * quantities(path.at(t_s), model)[index]
 
-        at_s, most = highest(times_s, [sign * row[index] for row in rows], value)
+        at_s, most = highest(times_s, sign * rows[index], value)
         most *= sign
         share = (most / limit if bound.upper else limit / most if most > 0.0 else inf) if isfinite(limit) else None
         name = bound.quantity if bound.key != "thrust_min_n" else "thrust, least"
         found.append(Peak(name, most, bound.unit, at_s, limit if isfinite(limit) else None, share))
         if bound.key == "acceleration_max_m_s2":
-            at_s, most = highest(times_s, [hypot(*r.j) for r in references], lambda t_s: hypot(*path.at(t_s).j))
+            at_s, most = highest(times_s, np.sqrt((scan.j**2).sum(0)), lambda t_s: hypot(*path.at(t_s).j))
             found.append(Peak("jerk", most, "m/s^3", at_s, None, None))
     at_s, share = _torque_use(path, model, of)
     needs = demand(path.at(at_s), model)
@@ -248,7 +251,7 @@ def _torque_use(path: Anchored, model: PointMass, of: torque.Body) -> tuple[floa
         return torque.use(path.at(t_s), model, of)
 
     times_s = grid(path)
-    worst = highest(times_s, [share(t_s) for t_s in times_s], share)
+    worst = highest(times_s, torque_uses(batch(path, times_s), model, of), share)
     for at_s, before, after in path.joints():
         if at_s <= times_s[-1]:
             at_joint = max(torque.use(before, model, of), torque.use(after, model, of))

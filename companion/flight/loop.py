@@ -14,19 +14,22 @@ import math
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 from companion.config import Flight
+from companion.control import flat
 from companion.control.output import Setpoint
-from companion.control.types import State
+from companion.control.types import Quat, State, Vec3
 from companion.errors import LinkError
 from companion.flight.clock import VehicleClock
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
 from companion.flight.controller import controller_of
 from companion.flight.course import Course, at_rest
 from companion.flight.guards import Guards, coast_setpoint
+from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
-from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Outcome, Phase
+from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
@@ -78,6 +81,22 @@ class Progress(NamedTuple):
     duration_s: float
     error_m: float
     steps: int
+    to_go_s: float
+    """Of the whole course, at its own pace."""
+    lyapunov: float
+    disturbance_m_s2: Vec3
+    """As estimated, NED; NaN, as the one before, where the law does not fly."""
+    position_m: Vec3
+    """As received, NED."""
+    attitude: Quat
+    """As received."""
+    reference_m: Vec3
+    """NED."""
+    thrust_n: float
+    """NaN where the law does not fly."""
+    state_age_ms: float
+    battery: float | None
+    """Share that is left; None: unknown."""
 
 
 class _Step(NamedTuple):
@@ -87,7 +106,7 @@ class _Step(NamedTuple):
     out: TrackerStep
     course: Course
     course_s: float
-    """Time on the course [s]."""
+    """Time since engaging [s]."""
     phase: Phase
     track_s: float
     skipped: int
@@ -107,6 +126,9 @@ class FlightLoop:
         progress: called at most ten times per second of wall time; must not block.
         connect_timeout_s: how long to wait for the first heartbeat (wall time).
         connection: what to call the link in explanations.
+        system: the vehicle's system id, where it is known already.
+        host: the program around it.
+        engaged: called when the controller takes over, and again after its course's pace was changed; must not block.
     """
 
     def __init__(
@@ -120,6 +142,9 @@ class FlightLoop:
         progress: Callable[[Progress], None] = lambda progress: None,
         connect_timeout_s: float = 15.0,
         connection: str = "this link",
+        system: int | None = None,
+        host: Host | None = None,
+        engaged: Callable[[Engagement], None] = lambda engagement: None,
     ) -> None:
         self._flight = flight
         self._trajectory = trajectory
@@ -129,6 +154,9 @@ class FlightLoop:
         self._progress = progress
         self._connect_timeout_s = connect_timeout_s
         self._connection = connection
+        self._system = system
+        self._host: Host = Alone() if host is None else host
+        self._engaged = engaged
         self._tracker = controller_of(flight, compiled)
         self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
         self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
@@ -167,6 +195,25 @@ class FlightLoop:
         """Asks for the hand-over to Hold; safe to call from a signal handler."""
         self._interrupted = True
 
+    def order(self, order: Order) -> str:
+        """Takes an operator's order; returns "" or why it cannot be followed."""
+        return self._sequence.orders.give(order) if self._met else "the flight has not begun"
+
+    @property
+    def phase(self) -> Phase:
+        """Where in the flight it is."""
+        return self._sequence.phase if self._met else Phase.CONNECT
+
+    @property
+    def paused(self) -> bool:
+        """Whether the reference is at rest for a pause."""
+        return self._met and self._sequence.orders.resting
+
+    @property
+    def autopilot(self) -> Autopilot:
+        """What the autopilot has said of itself."""
+        return self._autopilot
+
     def run(self) -> Outcome:
         """Flies. Returns how it ended; never raises for anything that the vehicle, the link or the law does."""
         fault = ""
@@ -188,6 +235,7 @@ class FlightLoop:
             return Outcome(cause, detail, [], 0, {}, fault)
         rejected = {reason.name: n for reason, n in self._telemetry.rejected.items() if n}
         read = dict(self._autopilot.parameters)
+        self._keep_ramps()
         return Outcome(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement)
 
     def _fly(self) -> tuple[Cause, str]:
@@ -223,7 +271,9 @@ class FlightLoop:
             FlightEnded: none came.
         """
         self._begun_ns = time.monotonic_ns()
-        system = find_autopilot(self._wire, self._connection, self._connect_timeout_s, lambda: self._interrupted)
+        system = self._system
+        if system is None:
+            system = find_autopilot(self._wire, self._connection, self._connect_timeout_s, lambda: self._interrupted)
         self._heard_ns = self._spoken_ns = time.monotonic_ns()
         self._telemetry = Telemetry(system)
         self._ops = Operations(self._wire.send, system)
@@ -265,6 +315,7 @@ class FlightLoop:
             self._tick()
         self._answer_requests()
         self._account()
+        self._host.turn()
         self._look_at_the_wall_clock()
 
     def _wait_s(self) -> float:
@@ -292,16 +343,19 @@ class FlightLoop:
     def _on_frame(self, frame: Frame) -> None:
         msgid = frame.msgid
         if frame.sysid != self._ops.target_system or frame.compid != AUTOPILOT_COMPONENT:
+            self._host.on_frame(frame)
             return
         self._heard_ns = frame.arrival_wall_ns
         if msgid == codec.ODOMETRY:
             self._on_odometry(frame)
         elif msgid == codec.TIMESYNC:
             self._on_timesync(frame)
-        elif msgid == codec.HEARTBEAT:
-            take_heartbeat(self._autopilot, frame)
-        elif not self._ops.on_frame(frame, self._clock.now_s(frame.arrival_wall_ns)):
-            take_report(self._autopilot, frame)
+        else:
+            if msgid == codec.HEARTBEAT:
+                take_heartbeat(self._autopilot, frame)
+            elif not self._ops.on_frame(frame, self._clock.now_s(frame.arrival_wall_ns)):
+                take_report(self._autopilot, frame)
+            self._host.on_frame(frame)
 
     def _on_odometry(self, frame: Frame) -> None:
         state = self._telemetry.on_odometry(frame)
@@ -422,6 +476,14 @@ class FlightLoop:
         assert course is not None
         begin_s = self._sequence.engaged_at_s
         self._engagement = Engagement(begin_s, course.hold_point, course.yaw_rad, course.home, state.q, thrust_n)
+        self._engaged(self._engagement)
+
+    def _keep_ramps(self) -> None:
+        """Notes and tells how the course's pace was changed."""
+        engagement, course = self._engagement, self._sequence.course
+        if engagement is not None and course is not None and engagement.ramps != course.ramps:
+            self._engagement = replace(engagement, ramps=course.ramps)
+            self._engaged(self._engagement)
 
     def _track(self, state: VehicleState, skipped: int, arrival_ns: int) -> None:
         sequence = self._sequence
@@ -453,8 +515,18 @@ class FlightLoop:
             self._sequence.end(*finding, self._last_state_s)
         if sent_ns - self._progress_ns > PROGRESS_NS:
             self._progress_ns = sent_ns
-            course_s = step.course.track_s
-            self._progress(Progress(step.phase.value, step.track_s, course_s, math.hypot(*error), len(self._record)))
+            self._progress(self._standing(step, reference.p, math.hypot(*error), timing.age_ms))
+            self._keep_ramps()
+
+    def _standing(self, step: _Step, reference_m: Vec3, error_m: float, age_ms: float) -> Progress:
+        course, n, state = step.course, step.out.numbers, step.state
+        to_go_s = max(0.0, course.duration_s - course.course_s(step.course_s))
+        north, east, down = n[flat.B_HAT]
+        return Progress(
+            *(step.phase.value, step.track_s, course.track_s, error_m, len(self._record), to_go_s),
+            *(n[flat.LYAPUNOV], (north, east, down), state.p, state.q, reference_m, n[flat.TOTAL], age_ms),
+            self._autopilot.battery,
+        )
 
     def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:
         took_ns = sent_ns - arrival_ns

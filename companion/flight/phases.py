@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 from companion.control.types import Quat, Vec3
 from companion.errors import ExitCode
+from companion.flight.retuning import Transition
+from companion.flight.tempo import Ramp
 from companion.frames import GeoPoint
 from companion.link.modes import Mode
 from companion.record.summary import PhaseChange
@@ -24,6 +26,8 @@ class Phase(StrEnum):
     TRACK = "track"
     HOLD = "hold"
     LAND = "land"
+    PAUSE = "pause"
+    """The course is slowed to rest, at rest, or getting back to its pace, as an operator asked."""
 
 
 PHASE_NAMES = tuple(phase.value for phase in Phase)
@@ -42,6 +46,7 @@ class Cause(Enum):
 
     COMPLETED = Ending("the flight was completed", ExitCode.DONE)
     INTERRUPTED = Ending("interrupted by the operator", ExitCode.INTERRUPTED)
+    STOPPED = Ending("stopped by the operator", ExitCode.DONE)
     REFUSED = Ending("refused by a gate", ExitCode.REFUSED)
     NO_VEHICLE = Ending("no vehicle was found", ExitCode.LOST)
     STATE_LOST = Ending("no usable state came from the vehicle any more", ExitCode.LOST)
@@ -54,6 +59,17 @@ class Cause(Enum):
     TILT = Ending("the tilt left its limit", ExitCode.LOST)
     UNSENDABLE = Ending("the controller gave a setpoint that must not be sent", ExitCode.INTERNAL)
     FAULT = Ending("a fault of the program", ExitCode.INTERNAL)
+
+
+class Order(StrEnum):
+    """What an operator may ask of a flight that is under way."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    STOP = "stop"
+    """To rest on the course, then Hold."""
+    LAND = "land"
+    """The same, then landing where it is."""
 
 
 class FlightEnded(Exception):  # noqa: N818 - it names what happened, not a fault
@@ -91,6 +107,8 @@ class Autopilot:
     """The same on the Earth, altitude above mean sea level; None while the vehicle has no global position."""
     home_amsl_m: float | None = None
     """Its altitude above mean sea level [m]."""
+    battery: float | None = None
+    """Share that is left in the first battery; None: unknown."""
     hold_thrust: float | None = None
     """Thrust setpoint while the autopilot itself held the vehicle, smoothed (0 to 1)."""
     parameters: dict[str, float] = field(default_factory=dict)
@@ -112,6 +130,10 @@ class Engagement:
     """Body to NED, at that moment."""
     thrust_n: float | None
     """The thrust that held the vehicle; None: the weight was taken."""
+    ramps: tuple[Ramp, ...] = ()
+    """How the course's pace was changed on the way."""
+    transitions: tuple[Transition, ...] = ()
+    """How the law's parameters were changed on the way."""
 
     @classmethod
     def from_numbers(cls, entry: Mapping[str, Any]) -> Engagement:
@@ -124,6 +146,8 @@ class Engagement:
             None if home is None else _vector(home),
             _quaternion(entry["attitude"]),
             None if thrust is None else float(thrust),
+            tuple(Ramp(*(float(x) for x in ramp)) for ramp in entry.get("ramps", ())),
+            tuple(Transition.from_numbers(way) for way in entry.get("transitions", ())),
         )
 
 
@@ -152,6 +176,14 @@ class Outcome:
     """The autopilot's parameters that were read."""
     engagement: Engagement | None = None
     """None: the controller never took over."""
+
+    def told(self) -> dict[str, Any]:
+        """What a flight's log keeps of it: JSON types only."""
+        return {
+            **{"cause": self.cause.name, "sentence": self.sentence, "lost_setpoints": self.lost_setpoints},
+            **{"rejected_states": self.rejected_states, "parameters": self.parameters},
+            "phases": [list(change) for change in self.phases],
+        }
 
     @property
     def sentence(self) -> str:

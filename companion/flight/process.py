@@ -13,22 +13,26 @@ import signal
 import socket
 import sys
 import traceback
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.config import build_flight, read_toml
+from companion.config import Flight, build_flight, read_toml
 from companion.errors import CompanionError, ExitCode
 from companion.flight.controller import controller_of
+from companion.flight.host import Host
 from companion.flight.loop import FlightLoop, Progress
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.preflight import BASELINE_PARAMETERS, gate_gains
-from companion.flight.tracker import kernels
+from companion.flight.tracker import Kernels, kernels
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, write_summary
 from companion.record.recorder import Recorder
 from companion.record.summary import FlightMeta, summarise
+from companion.record.ulog import Level
+from companion.trajectory.anchored import Trajectory
 from companion.trajectory.load import of_flight
 
 MARGIN_S = 120.0
@@ -74,39 +78,108 @@ class Signals:
         self._loop.interrupt()
 
 
+@dataclass
+class Ready:
+    """A flight that only the link is missing for."""
+
+    folder: Path
+    flight: Flight
+    trajectory: Trajectory
+    compiled: Kernels
+    record: FlightRecord
+    recorder: Recorder
+
+    @classmethod
+    def made(cls, folder: Path, engine: str, line: Callable[[str], None]) -> Ready:
+        """Reads and gates the flight of a folder, compiles, reserves, and starts the recorder.
+
+        Args:
+            folder: holds flight.toml.
+            engine: "auto", "python" or "numba".
+            line: gets lines for people.
+
+        Raises:
+            CompanionError: the flight is not to be flown as it stands.
+        """
+        path = folder / CONFIGURATION_FILE
+        flight = build_flight(read_toml(path), str(path))
+        trajectory = of_flight(flight)
+        compiled = kernels(engine)
+        if flight.output.controller == "law":
+            gate_gains(flight.vehicle)
+            line(f"engine: {compiled.engine}")
+        else:
+            line("controller: PX4's own, it gets the reference as setpoints")
+        warm_up(flight, compiled)
+        capacity = int((trajectory.duration_s + MARGIN_S) * flight.vehicle.link.state_rate_hz * 1.1)
+        record = FlightRecord(capacity, PHASE_NAMES)
+        recorder = Recorder.start(folder)
+        record.sink = recorder.offer_row
+        return cls(folder, flight, trajectory, compiled, record, recorder)
+
+    def loop(
+        self,
+        wire: Wire,
+        status: Status,
+        *,
+        connection: str,
+        timeout_s: float,
+        system: int | None = None,
+        host: Host | None = None,
+    ) -> FlightLoop:
+        """The loop that flies it over a link; arguments as of `FlightLoop`."""
+
+        def notify(line: str) -> None:
+            status.line(line)
+            self.recorder.note(line)
+
+        return FlightLoop(
+            *(self.flight, self.trajectory, wire, self.record, self.compiled, notify, status.progress),
+            connect_timeout_s=timeout_s,
+            connection=connection,
+            system=system,
+            host=host,
+            engaged=lambda engagement: self.recorder.state("engagement", json.dumps(asdict(engagement))),
+        )
+
+    def note_outcome(self, outcome: Outcome) -> None:
+        """The last line of the log, and what a summary needs to know beyond it."""
+        self.recorder.state("outcome", json.dumps(outcome.told()))
+        ended_well = outcome.cause in {Cause.COMPLETED, Cause.STOPPED}
+        self.recorder.note(outcome.sentence, Level.NOTICE if ended_well else Level.ERROR)
+
+    def close(self, status: Status, outcome: Outcome | None) -> int:
+        """Ends the recorder, writes record and summary into the folder, and returns the exit code.
+
+        Args:
+            status: gets what went wrong.
+            outcome: how the flight ended; None: it never began.
+        """
+        self.recorder.close()
+        if self.recorder.problem:
+            status.line(self.recorder.problem)
+        if outcome is None:
+            return int(ExitCode.INTERNAL)
+        if outcome.fault:
+            print(outcome.fault, file=sys.stderr)
+        return _finish(self.folder, self.flight, self.trajectory, self.record, outcome, status)
+
+
 def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: Status, signals: Signals) -> int:
     """Flies the flight of a folder and writes record and summary into it. Returns the exit code."""
-    path = folder / CONFIGURATION_FILE
-    flight = build_flight(read_toml(path), str(path))
-    trajectory = of_flight(flight)
-    compiled = kernels(engine)
-    if flight.output.controller == "law":
-        gate_gains(flight.vehicle)
-        status.line(f"engine: {compiled.engine}")
-    else:
-        status.line("controller: PX4's own, it gets the reference as setpoints")
-    warm_up(flight, compiled)
-    capacity = int((trajectory.duration_s + MARGIN_S) * flight.vehicle.link.state_rate_hz * 1.1)
-    record = FlightRecord(capacity, PHASE_NAMES)
-    recorder = Recorder.start(folder)
+    ready = Ready.made(folder, engine, status.line)
+    outcome = None
     try:
-        with Wire.open(connection, tap=recorder.offer) as wire:
-            loop = FlightLoop(
-                *(flight, trajectory, wire, record, compiled, status.line, status.progress),
-                connect_timeout_s=timeout_s,
-                connection=connection,
-            )
+        with Wire.open(connection, tap=ready.recorder.offer) as wire:
+            loop = ready.loop(wire, status, connection=connection, timeout_s=timeout_s)
             signals.hand_to(loop)
             status.send(ready=True)
             outcome = loop.run()
+            ready.note_outcome(outcome)
             status.send(flown=True)
     finally:
-        recorder.close()
-    if recorder.problem:
-        status.line(recorder.problem)
-    if outcome.fault:
-        print(outcome.fault, file=sys.stderr)
-    return _finish(folder, flight, trajectory, record, outcome, status)
+        code = ready.close(status, outcome)
+    return code
 
 
 def warm_up(flight: Any, compiled: Any) -> None:

@@ -15,13 +15,14 @@ from companion.link import codec
 from companion.link.framing import Frame
 from companion.link.modes import HOLD, Mode
 
+BATTERY_STATUS = 147
 HOLD_THRUST_SHARE = 0.2
 """Of a new value in the smoothed thrust of the autopilot's hover."""
 HOLD_THRUST_TRUST = 0.25
 """A measured hover thrust further from the weight is not believed: the vehicle file or the message is wrong."""
 
 _LANDED_STATES = {state.value: state for state in LandedState}
-_REPORTS = {CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET}
+_REPORTS = {CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET, BATTERY_STATUS}
 
 
 def take_heartbeat(autopilot: Autopilot, frame: Frame) -> None:
@@ -32,8 +33,8 @@ def take_heartbeat(autopilot: Autopilot, frame: Frame) -> None:
 
 
 def take_report(autopilot: Autopilot, frame: Frame) -> None:
-    """CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET; others, and what cannot be read, change
-    nothing."""
+    """CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET, BATTERY_STATUS; others, and what cannot be
+    read, change nothing."""
     if frame.msgid not in _REPORTS:
         return
     message: Any = codec.decode_cold(frame)
@@ -44,6 +45,9 @@ def take_report(autopilot: Autopilot, frame: Frame) -> None:
         autopilot.intended = Mode.from_custom_mode(message.intended_custom_mode)
     elif frame.msgid == EXTENDED_SYS_STATE:
         autopilot.landed = _LANDED_STATES.get(message.landed_state, LandedState.UNDEFINED)
+    elif frame.msgid == BATTERY_STATUS:
+        if message.id == 0:
+            autopilot.battery = None if message.battery_remaining < 0 else 1e-2 * message.battery_remaining
     elif frame.msgid == ATTITUDE_TARGET:
         if autopilot.mode == HOLD and 0.0 < message.thrust < 1.0:
             before = message.thrust if autopilot.hold_thrust is None else autopilot.hold_thrust

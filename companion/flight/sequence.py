@@ -15,7 +15,8 @@ from companion.control.types import Vec3
 from companion.errors import RefusedError
 from companion.flight.course import Course
 from companion.flight.inspection import gate_ground
-from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Phase
+from companion.flight.orders import Orders
+from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Order, Phase
 from companion.flight.preflight import Preflight
 from companion.frames import yaw_from_quat
 from companion.link import modes
@@ -102,7 +103,15 @@ class Sequence:
         self._settled_since_s: float | None = None
         self._mode_seen = False
         self._mode_at_end: Mode | None = None
+        self._mode_at_landing: Mode | None = None
         self._confirmed_hold_s: float | None = None
+        self.orders = Orders(self, autopilot, flight.vehicle.link.state_rate_hz)
+        """What the operator wants."""
+
+    @property
+    def stamp_s(self) -> float:
+        """Vehicle time of the newest state's stamp [s]."""
+        return 0.0 if self._state is None else self._state.t_vehicle_us * 1e-6
 
     @property
     def owes_hold(self) -> bool:
@@ -139,6 +148,7 @@ class Sequence:
         self._ops.update(now_s)
         if self.ending is None:
             self._watch_mode(now_s)
+            self.orders.tick(now_s)
         if self.ending is not None:
             self._hand_over(now_s)
         elif self.phase is Phase.PREFLIGHT:
@@ -287,6 +297,7 @@ class Sequence:
             self.duty = Duty.TRACK
             self.engaged_at_s = self._state.t_vehicle_us * 1e-6
             self._engage(self._state)
+            self.orders.follow(self.course)
             if self.course.join_s == 0.0:
                 self.enter(Phase.TRACK, self.engaged_at_s, "OFFBOARD confirmed; the controller joins the trajectory")
             else:
@@ -298,7 +309,7 @@ class Sequence:
         """Track and hold begin on the course's own clock, at the state that reaches them."""
         course = self.course
         assert course is not None
-        t = stamp_s - self.engaged_at_s
+        t = course.course_s(stamp_s - self.engaged_at_s)
         if self.phase is Phase.JOIN and t >= course.join_s:
             self.enter(Phase.TRACK, stamp_s, "the join is done")
         elif self.phase is Phase.TRACK and t >= course.join_s + course.track_s:
@@ -307,18 +318,37 @@ class Sequence:
     def track_time_s(self, stamp_s: float) -> float:
         """Time on the trajectory of a state [s]; negative during the join."""
         assert self.course is not None
-        return stamp_s - self.engaged_at_s - self.course.join_s
+        return self.course.course_s(stamp_s - self.engaged_at_s) - self.course.join_s
+
+    def phase_on_course(self, t_s: float) -> Phase:
+        """The phase that the course is in, `t_s` after engaging."""
+        assert self.course is not None
+        t = self.course.course_s(t_s)
+        if t < self.course.join_s:
+            return Phase.JOIN
+        return Phase.TRACK if t < self.course.join_s + self.course.track_s else Phase.HOLD
 
     def _finish(self, now_s: float) -> None:
         """After the stop: back to the autopilot, in Hold or landing."""
         assert self.course is not None
-        if now_s - self.engaged_at_s < self.course.duration_s + HOLD_SETTLE_S:
+        if now_s - self.engaged_at_s < self.course.over_s + HOLD_SETTLE_S:
             return
-        if self._flight.after == "land":
-            self.duty = Duty.TRACK
+        wish = self.orders.ended_by
+        if wish is Order.LAND:
+            self.land_from_here(now_s)
+        elif wish is Order.STOP:
+            self.end(Cause.STOPPED, "", now_s)
+        elif self._flight.after == "land":
             self.enter(Phase.LAND, now_s, "the flight file asks for a landing")
         else:
             self.end(Cause.COMPLETED, "", now_s)
+
+    def land_from_here(self, now_s: float) -> None:
+        """The operator wants the vehicle to land, whatever phase this is."""
+        self._mode_at_landing = self._autopilot.mode
+        if self.duty is not Duty.TRACK:
+            self.duty = Duty.NOTHING
+        self.enter(Phase.LAND, now_s, "the operator asks for a landing")
 
     def _land(self, now_s: float) -> None:
         if self._operation is None:
@@ -328,7 +358,8 @@ class Sequence:
         elif self._refused(self._operation, now_s):
             return
         if self.duty is Duty.NOTHING and self._autopilot.landed is LandedState.ON_GROUND and not self._autopilot.armed:
-            raise FlightEnded(Cause.COMPLETED, "landed and disarmed")
+            cause = Cause.COMPLETED if self.orders.ended_by is None else Cause.STOPPED
+            raise FlightEnded(cause, "landed and disarmed")
         if now_s - self._since_s > LANDING_TIMEOUT_S:
             raise FlightEnded(Cause.STATE_LOST, f"no landing was reported within {LANDING_TIMEOUT_S:g} s")
 
@@ -359,7 +390,8 @@ class Sequence:
         if self.phase is Phase.LAND:
             if not self._autopilot.armed:
                 return None
-            return {modes.LAND} if self._mode_seen else {modes.OFFBOARD, modes.LAND}
+            before = self._mode_at_landing or modes.OFFBOARD
+            return {modes.LAND} if self._mode_seen else {modes.OFFBOARD, modes.LAND, before}
         if self.duty is Duty.STREAM:
             return {modes.HOLD} if self._operation is None else {modes.HOLD, modes.OFFBOARD}
         return {modes.OFFBOARD} if self.duty is Duty.TRACK else None

@@ -7,6 +7,7 @@ or compiled as one kernel.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -21,6 +22,7 @@ from companion.control.output import Conversion, Setpoint, actuator_output, atti
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.control.vectors import axes
 from companion.flight.prediction import Piece, Prediction
+from companion.flight.retuning import Transition, Turning, between
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 PIECES_MAX = 100
@@ -33,6 +35,15 @@ class Engine(Protocol):
 
     def begin(self, controller: ControllerState) -> None:
         """Takes a new controller state."""
+        ...
+
+    @property
+    def controller(self) -> ControllerState:
+        """The controller's state after the last step."""
+        ...
+
+    def retune(self, parameters: Parameters) -> None:
+        """Steps with these parameters from now on; the model stays."""
         ...
 
     def step(
@@ -86,6 +97,16 @@ class PlainEngine:
         """Takes a new controller state."""
         self._controller = controller
 
+    @property
+    def controller(self) -> ControllerState:
+        """The controller's state after the last step."""
+        assert self._controller is not None
+        return self._controller
+
+    def retune(self, parameters: Parameters) -> None:
+        """Steps with these parameters from now on; the model stays."""
+        self._parameters = parameters
+
     def step(
         self,
         state: State,
@@ -120,6 +141,7 @@ class CompiledEngine:
         self._kernel: Any = accelerate.compile_kernel(flat.control_step)
         self._x = np.zeros(flat.PIECES + flat.PIECE * PIECES_MAX)
         self._y = np.zeros(flat.RESULTS)
+        self._lags = lags
         self._c = np.array(flat.constants(parameters, lags))
         self._bytes = self._x.data.cast("B")
         self._result = self._y.data.cast("B")
@@ -130,6 +152,15 @@ class CompiledEngine:
     def begin(self, controller: ControllerState) -> None:
         """Takes a new controller state."""
         self._x[flat.CONTROLLER : flat.PIECES] = flat.controller_numbers(controller)
+
+    @property
+    def controller(self) -> ControllerState:
+        """The controller's state after the last step."""
+        return flat.controller_of_numbers(self._x[flat.CONTROLLER : flat.PIECES].tolist())
+
+    def retune(self, parameters: Parameters) -> None:
+        """Steps with these parameters from now on; the model stays."""
+        self._c[:] = flat.constants(parameters, self._lags)
 
     def step(
         self,
@@ -224,7 +255,12 @@ class Tracker:
         self.delay_s = vehicle.delay_s if vehicle.controller.prediction else 0.0
         self._prediction = self._new_prediction(0.0)
         length = self._prediction.length_s or self._interval_s
-        self._engine = compiled.build(self.parameters, factors((x, y, z, vehicle.rotors.lag_s), length))
+        lags = factors((x, y, z, vehicle.rotors.lag_s), length)
+        self._build = lambda parameters: compiled.build(parameters, lags)
+        self._engine: Engine = self._build(self.parameters)
+        self._transition: Transition | None = None
+        self.transitions: list[Transition] = []
+        """The ways to other parameters so far, the one under way among them."""
 
     def _new_prediction(self, thrust_n: float) -> Prediction:
         return Prediction(self.vehicle.rotors.lag_s, self.delay_s, thrust_n)
@@ -267,11 +303,63 @@ class Tracker:
                 dt, integrate = self._interval_s, False
         self._last_s = stamp_s
         prediction = self._prediction
+        if self._transition is not None:
+            self._follow(self._transition, stamp_s, state)
         pieces = prediction.pieces(stamp_s)
         reference = reference_at(stamp_s + self.delay_s)
         numbers = self._engine.step(state, reference, prediction.thrust, pieces, frozen or not integrate, integrate, dt)
         prediction.sent(stamp_s, numbers[flat.THRUST], numbers[flat.RATES_MODEL])
         return TrackerStep(self._convert(numbers, dt), numbers)
+
+    # -- other parameters in flight -------------------------------------------------------------------------------
+
+    @property
+    def changing(self) -> bool:
+        """Whether the parameters are on their way to others."""
+        return self._transition is not None
+
+    def retune(self, parameters: Parameters, ramp_s: float) -> None:
+        """Moves the law's parameters to others: linearly over `ramp_s` [s] of vehicle time, from the next step on.
+
+        Whether they and the way there are sound is the caller's affair (`retuning.Retuning`).
+
+        Args:
+            parameters: with the model that flies; `retuning.flown` makes them.
+            ramp_s: above 0 [s].
+
+        Raises:
+            ValueError: one change is under way, or this one has another model.
+        """
+        if self.changing:
+            raise ValueError("the parameters are on their way to others")
+        if parameters.model != self.parameters.model or not ramp_s > 0.0:
+            raise ValueError("the model does not change in flight, and nothing changes in no time")
+        self._transition = Transition(math.nan, ramp_s, self.parameters, parameters)
+
+    def _follow(self, way: Transition, stamp_s: float, state: State) -> None:
+        """The parameters for the state with this stamp."""
+        if math.isnan(way.begin_s):
+            self._transition = way = way._replace(begin_s=stamp_s)
+            self.transitions.append(way)
+            if way.new.gains.heading_kind != way.old.gains.heading_kind:
+                self._turn(way.old.gains.heading_kind, state)
+        share = min(max((stamp_s - way.begin_s) / way.duration_s, 0.0), 1.0)
+        self.parameters = between(way.old, way.new, share)
+        self._engine.retune(self.parameters)
+        engine = self._engine
+        if isinstance(engine, Turning):
+            engine.share = share
+            if share == 1.0:
+                self._engine = engine.new
+        if share == 1.0:
+            self._transition = None
+
+    def _turn(self, kind: int, state: State) -> None:
+        """Another kind of heading begins where the nose points."""
+        r1, r2, _ = axes(state.q)
+        engine = self._build(self.parameters)
+        engine.begin(self._engine.controller._replace(heading=HeadingState(r2, r1, False)))
+        self._engine = Turning(self._engine, engine, kind)
 
     def _convert(self, n: Numbers, dt_s: float) -> Setpoint:
         rates = (n[1], n[2], n[3])

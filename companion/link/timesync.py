@@ -75,16 +75,16 @@ class PacedPeer:
     def __init__(self, states: int = PACED_STATES) -> None:
         self._needed = states
         self._streak = 0
-        self._states = 0
         self._asked_us: int | None = None
         self.paced = False
         """Whether the vehicle waits for our answers."""
 
     def on_state(self, t_vehicle_us: int) -> None:
         """A new state came, with its own stamp."""
-        self._states += 1
         if self._asked_us is not None and t_vehicle_us - self._asked_us > PACED_INTERVAL_MAX_US:
             self._begin_anew()
+        elif self._streak >= self._needed:
+            self.paced = True  # with a state, before its time is mixed with that of the wall clock
 
     def on_request(self, ts1_ns: int) -> None:
         """A TIMESYNC request came from the vehicle, whose clock was `ts1_ns`."""
@@ -93,8 +93,7 @@ class PacedPeer:
         if last_us is not None and not 0 < asked_us - last_us <= PACED_INTERVAL_MAX_US:
             self._begin_anew()
         self._streak += 1
-        self.paced = self._states > 0 and self._streak >= self._needed
 
     def _begin_anew(self) -> None:
-        self._streak = self._states = 0
+        self._streak = 0
         self.paced = False

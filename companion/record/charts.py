@@ -31,6 +31,8 @@ ERRORS: Final = ("#0b6fb8", "#8250c4", "#c4337a", "#dd8a13")
 _SHADE: Final = "rgba(71, 104, 145, 0.07)"
 _LABELLED: Final = 0.09
 _TIME: Final = "Time on the track [s]"
+TIME: Final = "time"
+"""Marks a layout whose x axis is zoomed together with the others of its kind."""
 
 
 class Phase(NamedTuple):
@@ -136,7 +138,7 @@ def time_layout(time_s: Array, phases: Sequence[Phase], titles: Sequence[str]) -
     rows = len(titles)
     gap = 0.0 if rows == 1 else 0.30 / rows
     height = (1.0 - gap * (rows - 1)) / rows
-    layout = base_layout() | {"hovermode": "x unified"}
+    layout = base_layout() | {"hovermode": "x unified", "meta": TIME}
     ends = [float(time_s[0]), float(time_s[-1])] if len(time_s) else [0.0, 1.0]
     layout["xaxis"] = axis_style(_TIME) | {"range": ends, "anchor": _axis("y", rows), "zeroline": False}
     for row, title in enumerate(titles, start=1):

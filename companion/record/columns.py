@@ -80,5 +80,7 @@ LIMIT_NAMES: Final[dict[int, str]] = {
 TRACK_PHASE: Final = "track"
 """The phase that the statistics are made of."""
 
-DEFAULT_PHASE_NAMES: Final[tuple[str, ...]] = ("connect", "preflight", "takeoff", "join", "track", "hold", "land")
-"""The phases of a flight in their usual order."""
+DEFAULT_PHASE_NAMES: Final[tuple[str, ...]] = (
+    *("connect", "preflight", "takeoff", "join", "track", "hold", "land", "pause"),
+)
+"""The phases of a flight, in the order of their numbers."""

@@ -1,91 +1,31 @@
-"""The figures of a flight's report: the paper's five, and the position error over time.
+"""The figures of a flight's report over time: position error, the paper's, and what the law made of the state.
 
 Each function takes the flight and returns a figure as a plain dictionary in the terms of plotly.js, with arrays in it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 
 from companion.record.charts import (
     AXES,
-    BAND,
     ERRORS,
     FAINT,
     INK,
     Array,
-    Phase,
     add_level,
-    axis_style,
-    base_layout,
-    line,
     lines,
     logarithmic,
-    thin,
     time_layout,
 )
 from companion.record.columns import TRACK_PHASE
-from companion.record.flight_record import FlightRecord
+from companion.record.figures_path import path_in_space, plan_close, plan_view
+from companion.record.figures_vehicle import attitude, events, heading, rates, timing
+from companion.record.flight_data import Figure, FlightData
 from companion.record.summary import SETTLED_BELOW_M, body_velocity
-
-
-@dataclass(frozen=True)
-class FlightData:
-    """A flight as the figures need it."""
-
-    record: FlightRecord
-    summary: Mapping[str, Any]
-    truth: Mapping[str, Array]
-    """Columns of the simulated vehicle's truth.csv; empty when there is none."""
-    mass_kg: float | None
-    limits: Mapping[str, Any]
-    """The table [limits] that was used."""
-
-    @property
-    def start_s(self) -> float:
-        """Vehicle time at which the trajectory began, or the record when it never did."""
-        on_track = np.flatnonzero(self.record.in_phase(TRACK_PHASE) & np.isfinite(self.record.column("track_s")))
-        if len(on_track):
-            return float(self.record.column("t_s")[on_track[0]] - self.record.column("track_s")[on_track[0]])
-        return float(self.record.column("t_s")[0]) if len(self.record) else 0.0
-
-    @property
-    def time_s(self) -> Array:
-        """The figures' time axis, shape (len,)."""
-        return self.record.column("t_s") - self.start_s
-
-    @property
-    def phases(self) -> list[Phase]:
-        """The phases within the record."""
-        if not len(self.record):
-            return []
-        first, last = float(self.time_s[0]), float(self.time_s[-1])
-        known = [entry for entry in self.summary.get("phases", []) if entry["at_s"] is not None]
-        begins = [max(entry["at_s"] - self.start_s, first) for entry in known]
-        ends = [*begins[1:], last]
-        return [
-            Phase(entry["name"], begin, min(end, last), entry["reason"])
-            for entry, begin, end in zip(known, begins, ends, strict=True)
-            if begin < min(end, last)
-        ]
-
-
-class Figure(NamedTuple):
-    """A figure with the text around it."""
-
-    key: str
-    title: str
-    caption: str
-    height_px: int
-    build: Callable[[FlightData], dict[str, Any]]
-    close: Callable[[FlightData], dict[str, Any] | None] | None = None
-    """A second panel beside it, where it adds something."""
-    of_law: bool = False
-    """Whether it shows numbers that only the law has."""
 
 
 def _time_layout(flight: FlightData, titles: Sequence[str]) -> dict[str, Any]:
@@ -118,60 +58,6 @@ def position_error(flight: FlightData) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _reference(flight: FlightData) -> Array:
-    """North and east of the reference, shape (len, 2); NaN outside of the track phase."""
-    on_track = flight.record.in_phase(TRACK_PHASE)
-    return np.where(on_track[:, None], flight.record.columns("ref_n", "ref_e"), np.nan)
-
-
-def plan_view(flight: FlightData) -> dict[str, Any]:
-    """The path against its reference, north up and east to the right."""
-    path, reference = flight.record.columns("p_n", "p_e"), _reference(flight)
-    flown, wanted = thin(path), thin(reference)
-    hover = {"hovertemplate": "north %{y:.2f} m, east %{x:.2f} m"}
-    data = [
-        line(reference[wanted, 1], reference[wanted, 0], "reference", BAND, width=6, **hover),
-        line(path[flown, 1], path[flown, 0], "flown", AXES[0], width=1.6, **hover),
-    ]
-    if len(path):
-        marker = {"symbol": "circle", "size": 11, "color": "white", "line": {"color": AXES[0], "width": 2.5}}
-        start = line(path[:1, 1], path[:1, 0], "start", AXES[0], **hover)
-        data.append(start | {"mode": "markers", "marker": marker})
-    layout = base_layout() | {"hovermode": "closest", "showlegend": True}
-    layout["legend"] = {"orientation": "h", "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom"}
-    layout["xaxis"] = axis_style("East [m]") | {"constrain": "domain"}
-    layout["yaxis"] = axis_style("North [m]") | {"scaleanchor": "x", "scaleratio": 1, "constrain": "domain"}
-    _show(layout, _extent(np.concatenate((path, reference))))
-    return {"data": data, "layout": layout}
-
-
-def plan_close(flight: FlightData) -> dict[str, Any] | None:
-    """The plan view around the reference; None where the whole one shows as much."""
-    whole, reference = _extent(flight.record.columns("p_n", "p_e")), _extent(_reference(flight))
-    if whole is None or reference is None or np.all(np.diff(whole, axis=0) < 1.3 * np.diff(reference, axis=0)):
-        return None
-    figure = plan_view(flight)
-    _show(figure["layout"], reference)
-    figure["layout"]["showlegend"] = False
-    return figure
-
-
-def _extent(points: Array) -> Array | None:
-    """The lowest and the highest north and east with a margin, shape (2, 2); None without any point."""
-    points = points[np.isfinite(points).all(axis=1)]
-    if not len(points):
-        return None
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.06 * float(np.max(high - low)) + 0.1
-    return np.stack((low - margin, high + margin))
-
-
-def _show(layout: dict[str, Any], extent: Array | None) -> None:
-    """Let the axes of a plan view span this."""
-    if extent is not None:
-        layout["yaxis"]["range"], layout["xaxis"]["range"] = extent.T.tolist()
-
-
 def body_velocities(flight: FlightData) -> dict[str, Any]:
     """Velocity in the body frame."""
     names = ["forward", "right", "down"]
@@ -197,13 +83,16 @@ def force_estimates(flight: FlightData) -> dict[str, Any]:
 
 
 def law_errors(flight: FlightData) -> dict[str, Any]:
-    """The four errors of the law: their sizes, and the components of the first."""
-    layout = _time_layout(flight, ["Size [m]", "e₁ [m]"])
+    """The four errors of the law: their sizes, the components of the first, and the Lyapunov function."""
+    layout = _time_layout(flight, ["Size [m]", "e₁ [m]", "V [m²]"])
     sizes = _norms(flight, "e1", "e2", "e3", "e4")
     layout["yaxis"] |= logarithmic(sizes)
     data = lines(flight.time_s, sizes, ["|e₁|", "|e₂|", "|e₃|", "|e₄|"], ERRORS)
     components = flight.record.columns("e1_n", "e1_e", "e1_d")
     data += lines(flight.time_s, components, ["north", "east", "down"], AXES, row=2)
+    lyapunov = flight.record.columns("lyapunov")
+    layout["yaxis3"] |= logarithmic(lyapunov)
+    data += lines(flight.time_s, lyapunov, ["V, without the estimate's own error"], [INK], row=3)
     return {"data": data, "layout": layout}
 
 
@@ -233,6 +122,13 @@ def _near(value: float, series: Array) -> bool:
 
 FIGURES: Final = (
     Figure(
+        "events",
+        "Events",
+        "What happened when: the phases, the limits that acted, late and skipped steps.",
+        240,
+        events,
+    ),
+    Figure(
         "position-error",
         "Position error",
         "Distance of the received position from the reference at the same instant; below, the settled part.",
@@ -246,6 +142,13 @@ FIGURES: Final = (
         460,
         plan_view,
         plan_close,
+    ),
+    Figure(
+        "path",
+        "The path in space",
+        "True to scale; turn it with the mouse or a finger.",
+        520,
+        path_in_space,
     ),
     Figure(
         "body-velocities",
@@ -265,8 +168,9 @@ FIGURES: Final = (
     Figure(
         "errors",
         "Figure 4: the four errors",
-        "Position, velocity, acceleration and jerk errors of the law at the predicted time, all scaled to metres.",
-        560,
+        "Position, velocity, acceleration and jerk errors of the law at the predicted time, all scaled to metres, and "
+        "the Lyapunov function that bounds them.",
+        760,
         law_errors,
         of_law=True,
     ),
@@ -277,6 +181,35 @@ FIGURES: Final = (
         660,
         actuation,
         of_law=True,
+    ),
+    Figure(
+        "rates",
+        "Thrust and body rates, commanded and actual",
+        "What the autopilot was asked for, and what the vehicle did; thrust as a share of full thrust.",
+        660,
+        rates,
+        of_law=True,
+    ),
+    Figure(
+        "attitude",
+        "Attitude",
+        "Roll and pitch as received, and the tilt between the vehicle's axis and the vertical.",
+        520,
+        attitude,
+    ),
+    Figure(
+        "heading",
+        "Heading",
+        "The heading, the direction of the path, and the angle to the desired heading where one is wanted.",
+        440,
+        heading,
+    ),
+    Figure(
+        "timing",
+        "Timing",
+        "By the wall clock: from a state's arrival to its setpoint's departure, and the state's age at that moment.",
+        440,
+        timing,
     ),
 )
 """The figures in the order of the report."""

@@ -18,7 +18,7 @@ from typing import Any, Final
 from companion import __version__
 from companion.frames import wrap_angle, yaw_from_quat
 from companion.record import topics, ulog
-from companion.record.columns import COLUMN_INDEX, COLUMNS
+from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES
 from companion.record.tlog import Direction
 from companion.record.traffic import Traffic
 from companion.record.ulog import Level, Number, Series, Topic
@@ -41,6 +41,8 @@ class Entry(IntEnum):
     """A row of the flight's record: doubles in the order of `columns.COLUMNS`."""
     TEXT = 17
     """A severity in one byte, and UTF-8."""
+    FACT = 18
+    """A key, a zero byte, and what is known under it, as UTF-8: the last one of a key counts."""
 
 
 class FlightLog:
@@ -79,6 +81,9 @@ class FlightLog:
             self._take_row(content)
         elif kind == Entry.TEXT:
             self._say(content[0], content[1:].decode("utf-8", "replace"))
+        elif kind == Entry.FACT:
+            key, _, fact = content.decode("utf-8", "replace").partition("\0")
+            self._out.append(ulog.long_info(key, fact))
         elif kind in {Direction.IN, Direction.OUT}:
             self._traffic.take(kind, content, wall_ns)
         self._begin_when_time_is_known(wall_ns)
@@ -139,6 +144,7 @@ class FlightLog:
                           ("trajectory", _name(self._settings, "trajectory"))):  # fmt: skip
             if isinstance(name, str):
                 yield ulog.info(key, name)
+        yield ulog.info("phase_names", ", ".join(DEFAULT_PHASE_NAMES))
         yield ulog.info("time_ref_utc", 0, "int32_t")
         if epoch_us is not None:
             yield ulog.info("time_utc_usec", epoch_us)
@@ -166,7 +172,7 @@ class FlightLog:
         row = _ROW.unpack(content)
         t_us = round(row[_T_S] * 1e6)
         self._mark_gap(t_us)
-        yaw = yaw_from_quat(row[_Q]) - row[_HEADING_ERROR]  # type: ignore[arg-type]
+        yaw = yaw_from_quat(row[_Q]) - row[_HEADING_ERROR]
         if self._envelope is None:
             self._envelope = envelope(self._settings, row[_LYAPUNOV], row[_B_HAT])
         numbers = (*row, wrap_angle(yaw) if math.isfinite(yaw) else math.nan, self._envelope)

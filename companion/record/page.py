@@ -101,10 +101,33 @@ const figures = JSON.parse(document.getElementById("figures").textContent);
 const touch = window.matchMedia("(pointer: coarse)").matches;
 const config = { responsive: true, displaylogo: false, modeBarButtons: [["resetScale2d", "toImage"]],
   displayModeBar: window.matchMedia("(hover: hover)").matches ? "hover" : false };
+const linked = figures.filter(figure => figure.layout.meta === "time").map(figure => figure.key);
+let following = false;
+// Zooming one time axis zooms all of them: what happened at the same time stands below one another.
+function follow(source, change) {
+  if (following) { return; }
+  const range = change["xaxis.range"] || [change["xaxis.range[0]"], change["xaxis.range[1]"]];
+  const whole = change["xaxis.autorange"] === true || change["autosize"] === true;
+  if (!whole && (range[0] === undefined || range[1] === undefined)) { return; }
+  following = true;
+  const others = linked.filter(key => key !== source).map(key => {
+    const home = document.getElementById(key).dataset;
+    const wanted = whole ? [Number(home.from), Number(home.to)] : [...range];
+    return Plotly.relayout(key, { "xaxis.range": wanted });
+  });
+  Promise.all(others).finally(() => { following = false; });
+}
 for (const figure of figures) {
   // On a touch screen a finger on a figure scrolls the page.
   figure.layout.dragmode = touch ? false : "zoom";
-  Plotly.newPlot(figure.key, figure.data, figure.layout, config);
+  const element = document.getElementById(figure.key);
+  if (linked.includes(figure.key)) {
+    [element.dataset.from, element.dataset.to] = figure.layout.xaxis.range;
+  }
+  Plotly.newPlot(element, figure.data, figure.layout, config);
+  if (linked.includes(figure.key)) {
+    element.on("plotly_relayout", change => follow(figure.key, change));
+  }
 }
 // Figures do not follow the paper by themselves. A page is 660 pixels wide and holds two figures of this height.
 window.addEventListener("beforeprint", () => {

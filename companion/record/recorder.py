@@ -1,9 +1,10 @@
-"""Writes the link's traffic to `link.tlog` from a process of its own.
+"""Writes the link's traffic to `link.tlog` and the flight to `flight.ulg` from a process of its own.
 
-The control process hands over every datagram through a ring in shared memory: no system call, nothing that blocks, and
-what finds no room is dropped and counted. A pair of Unix sockets says when the log begins and ends. The child has low
-priority, no socket but its end of the pair, and ignores the signals that end a command, so that neither Ctrl-C nor the
-death of the control process loses the log: it writes what was handed over and ends when the pair closes.
+The control process hands over every datagram, every row of its record and every text through a ring in shared memory:
+no system call, nothing that blocks, and what finds no room is dropped and counted. A pair of Unix sockets says when the
+logs begin and end. The child has low priority, no socket but its end of the pair, and ignores the signals that end a
+command, so that neither Ctrl-C nor the death of the control process loses the logs: it writes what was handed over and
+ends when the pair closes. One of the files may fail without the other.
 """
 
 from __future__ import annotations
@@ -25,17 +26,23 @@ from typing import Final
 
 from companion.errors import CompanionError, InputError
 from companion.record import ring
-from companion.record.ring import Entry, RingReader, RingWriter
-from companion.record.tlog import TLOG_FILE, encode_datagram
+from companion.record.flight_log import Entry, FlightLog, Level
+from companion.record.ring import RingReader, RingWriter
+from companion.record.tlog import TLOG_FILE, Direction, encode_datagram
+from companion.record.ulog import ULOG_FILE
 
-_REPORT = struct.Struct("=QQ")  # datagrams taken, datagrams dropped by the child
+_REPORT = struct.Struct("=QQQ")  # datagrams in link.tlog, datagrams dropped by the child, entries not in flight.ulg
 _READY: Final = b"ready"
 _RING_BYTES: Final = 16 << 20  # a minute and more of a usual link, should the child get no processor
 _PENDING_MAX: Final = 64 << 20  # bytes that wait for a disk that does not answer
+_BATCH: Final = 1 << 16  # bytes of flight.ulg that are handed to the disk at once
 _FLUSH_S: Final = 0.5
 _ROUND_S: Final = 0.05
 _START_TIMEOUT_S: Final = 20.0
 _NICE: Final = 10
+_DIRECTIONS: Final = {int(Direction.IN), int(Direction.OUT)}
+_FAILED_TLOG: Final = 64  # bits of the exit code; the interpreter's own failures are 1 and 2
+_FAILED_ULOG: Final = 128
 
 
 class Recorder:
@@ -48,11 +55,11 @@ class Recorder:
         self._put = writer.put
         self._closed = False
         self.dropped: int = 0
-        """Datagrams that are not in the log, because the recorder was too slow or gone."""
+        """Datagrams, rows and texts that are not in the logs, because the recorder was too slow or gone."""
         self.recorded: int | None = None
         """Datagrams that the recorder took; known after `close`, None when it did not say."""
         self.problem: str | None = None
-        """After `close`: what kept the log from being complete, in one line."""
+        """After `close`: what kept the logs from being complete, in one line."""
 
     @classmethod
     def start(cls, folder: Path) -> Recorder:
@@ -62,27 +69,24 @@ class Recorder:
         the log.
 
         Args:
-            folder: the flight's folder; it must not hold a log yet.
+            folder: the flight's folder; it must not hold logs yet. Its flight.toml goes into the log as it is.
 
         Raises:
-            InputError: the log cannot be created.
+            InputError: a log cannot be created.
             CompanionError: the child does not start.
         """
-        path = folder / TLOG_FILE
-        try:
-            log = path.open("xb", buffering=0)
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be created ({error.strerror}); choose another folder with --out"
-            ) from None
+        from companion.record.folder import CONFIGURATION_FILE  # not for the child, which starts this module too
+
+        tlog, log = _create(folder / TLOG_FILE), _create(folder / ULOG_FILE)
         epoch_minus_wall_ns = time.time_ns() - time.monotonic_ns()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         memory = ring.create(_RING_BYTES)
         try:
             writer = RingWriter(memory)
-            process = cls._spawn(theirs, log, memory, epoch_minus_wall_ns)
+            process = cls._spawn(theirs, tlog, log, memory, epoch_minus_wall_ns, folder / CONFIGURATION_FILE)
         finally:
             theirs.close()
+            tlog.close()
             log.close()
             os.close(memory)
         _await_ready(process, ours)
@@ -90,12 +94,15 @@ class Recorder:
         return cls(process, ours, writer)
 
     @staticmethod
-    def _spawn(link: socket.socket, log: FileIO, memory: int, epoch_minus_wall_ns: int) -> subprocess.Popen[bytes]:
+    def _spawn(
+        link: socket.socket, tlog: FileIO, log: FileIO, memory: int, epoch_minus_wall_ns: int, configuration: Path
+    ) -> subprocess.Popen[bytes]:
         # The package's own root as working directory: `-m` finds the package from there, installed or not, and the
         # folder from which the command was called stays free.
-        inherited = (link.fileno(), log.fileno(), memory)
+        inherited = (link.fileno(), tlog.fileno(), log.fileno(), memory)
+        arguments = (*map(str, inherited), str(epoch_minus_wall_ns), str(configuration.resolve()))
         return subprocess.Popen(
-            [sys.executable, "-m", __name__, *map(str, inherited), str(epoch_minus_wall_ns)],
+            [sys.executable, "-m", __name__, *arguments],
             pass_fds=inherited,
             cwd=Path(__file__).resolve().parents[2],
             stdin=subprocess.DEVNULL,
@@ -114,33 +121,63 @@ class Recorder:
         if self._closed or not self._put(direction, raw, wall_ns):
             self.dropped += 1
 
+    def offer_row(self, row: bytes | memoryview) -> None:
+        """Hand over the bytes of a row of the flight's record, as `FlightRecord.sink` gives them. Never blocks."""
+        if self._closed or not self._put(Entry.ROW, row, 0):
+            self.dropped += 1
+
+    def note(self, text: str, level: int = Level.NOTICE) -> None:
+        """Hand over a line for the log: what happened to the flight. Never blocks; the time is that of the traffic."""
+        content = bytes((level,)) + text.encode("utf-8", "replace")
+        if self._closed or not self._put(Entry.TEXT, content, 0):
+            self.dropped += 1
+
+    def state(self, key: str, fact: str) -> None:
+        """Hand over what is known under a key from now on, for the log. Never blocks; the last one of a key counts."""
+        content = f"{key}\0{fact}".encode("utf-8", "replace")
+        if self._closed or not self._put(Entry.FACT, content, 0):
+            self.dropped += 1
+
     def close(self, timeout_s: float = 10.0) -> None:
-        """End the log: the child writes what it has and ends. Waits for `timeout_s` at most; again does nothing."""
+        """End the logs: the child writes what it has and ends. Waits for `timeout_s` at most; again does nothing."""
         if self._closed:
             return
         self._closed = True
-        lost = 0
+        lost = missing = 0
+        both = f"{TLOG_FILE}, {ULOG_FILE}"
         try:
             self._link.shutdown(socket.SHUT_WR)
             self._link.settimeout(timeout_s)
             report = self._link.recv(_REPORT.size)
             if len(report) == _REPORT.size:
-                self.recorded, lost = _REPORT.unpack(report)
+                self.recorded, lost, missing = _REPORT.unpack(report)
             code = self._process.wait(timeout_s)
-            if code != 0 or self.recorded is None:
-                self.problem = f"{TLOG_FILE}: the recorder ended early (code {code}); the log is incomplete"
-                lost += self._writer.put_count - self._writer.taken
+            if self.recorded is None or code & ~(_FAILED_TLOG | _FAILED_ULOG):
+                self.problem = f"{both}: the recorder ended early (code {code}); the logs are incomplete"
+                lost = self._writer.put_count - self._writer.taken
+            elif code:
+                failed = [name for bit, name in ((_FAILED_TLOG, TLOG_FILE), (_FAILED_ULOG, ULOG_FILE)) if code & bit]
+                self.problem = f"{', '.join(failed)}: incomplete, the disk did not take everything"
         except (TimeoutError, subprocess.TimeoutExpired):
-            self.problem = f"{TLOG_FILE}: the recorder is still writing; wait before reading the log"
+            self.problem = f"{both}: the recorder is still writing; wait before reading the logs"
         except OSError as error:
-            self.problem = f"{TLOG_FILE}: the recorder is gone ({error.strerror}); the log is incomplete"
+            self.problem = f"{both}: the recorder is gone ({error.strerror}); the logs are incomplete"
             lost = self._writer.put_count - self._writer.taken
             self._process.poll()
         finally:
             self._link.close()
         self.dropped += lost
-        if self.problem is None and self.dropped:
-            self.problem = f"{TLOG_FILE}: {self.dropped} datagrams are missing, the recorder was too slow"
+        if self.problem is None and (self.dropped or missing):
+            count = max(self.dropped, missing)
+            self.problem = f"{both}: {count} entries are missing, the recorder was too slow"
+
+
+def _create(path: Path) -> FileIO:
+    """A new file, or an InputError."""
+    try:
+        return path.open("xb", buffering=0)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be created ({error.strerror}); choose another folder with --out") from None
 
 
 def _await_ready(process: subprocess.Popen[bytes], link: socket.socket) -> None:
@@ -152,14 +189,15 @@ def _await_ready(process: subprocess.Popen[bytes], link: socket.socket) -> None:
     process.kill()
     process.wait()
     link.close()
-    raise CompanionError(f"the recorder of {TLOG_FILE} did not start; try `{sys.executable} -m {__name__}`")
+    raise CompanionError(f"the recorder of {ULOG_FILE} did not start; try `{sys.executable} -m {__name__}`")
 
 
 class _DiskWriter:
     """Takes bytes at once and writes them from a thread, so that a slow disk does not stop the reading."""
 
-    def __init__(self, file: int) -> None:
+    def __init__(self, file: int, name: str) -> None:
         self._file = file
+        self._name = name
         self._pending = bytearray()
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -192,7 +230,7 @@ class _DiskWriter:
                 _write_all(self._file, entries)
             except OSError as error:
                 self.error = error
-                print(f"{TLOG_FILE}: {error.strerror}; no more traffic is recorded", file=sys.stderr)
+                print(f"{self._name}: {error.strerror}; nothing more is written, the flight goes on", file=sys.stderr)
 
 
 def _write_all(file: int, entries: bytearray) -> None:
@@ -204,24 +242,92 @@ def _write_all(file: int, entries: bytearray) -> None:
         os.fdatasync(file)
 
 
-def _receive(link: socket.socket, reader: RingReader, writer: _DiskWriter, epoch_minus_wall_ns: int) -> int:
-    """Take datagrams until the other side closes; returns how many of them had to be dropped.
+class _TrafficFile:
+    """link.tlog."""
 
-    This process looks from time to time instead of waiting: handing over a datagram then wakes nobody and costs the
+    def __init__(self, file: int, epoch_minus_wall_ns: int) -> None:
+        self.writer = _DiskWriter(file, TLOG_FILE)
+        self.dropped = 0
+        """Datagrams that the disk did not take."""
+        self.taken = 0
+        """Datagrams in the file."""
+        self._epoch_minus_wall_ns = epoch_minus_wall_ns
+
+    def take(self, entry: ring.Entry) -> None:
+        """Writes a datagram."""
+        wall_ns, direction, raw = entry
+        epoch_us = (wall_ns + self._epoch_minus_wall_ns) // 1000
+        if self.writer.put(encode_datagram(raw, epoch_us, direction)):
+            self.taken += 1
+        else:
+            self.dropped += 1
+
+
+class _FlightFile:
+    """flight.ulg. Whatever goes wrong with it leaves the traffic's log alone."""
+
+    def __init__(self, file: int, log: FlightLog) -> None:
+        self.writer = _DiskWriter(file, ULOG_FILE)
+        self.missing = 0
+        """Entries that are not in the file."""
+        self._log = log
+        self._batch: list[bytes] = []
+        self._entries = self._bytes = 0
+        self._unreadable = 0
+
+    def take(self, entry: ring.Entry) -> None:
+        """Writes what an entry amounts to."""
+        try:
+            self._add(self._log.take(entry.kind, entry.content, entry.wall_ns))
+        except Exception as error:
+            self.missing += 1
+            self._unreadable += 1
+            if self._unreadable == 1:
+                print(f"{ULOG_FILE}: an entry is left out ({type(error).__name__}: {error})", file=sys.stderr)
+
+    def _add(self, content: bytes) -> None:
+        self._batch.append(content)
+        self._entries += 1
+        self._bytes += len(content)
+        if self._bytes > _BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hands what has gathered to the disk: whole messages, or nothing of them."""
+        if self._bytes and not self.writer.put(b"".join(self._batch)):
+            self.missing += self._entries
+        self._batch.clear()
+        self._entries = self._bytes = 0
+
+    def refused(self, count: int) -> None:
+        """So many entries found no room in the ring."""
+        self._log.missed(count + self.missing)
+
+    def end(self) -> None:
+        """The end of the flight."""
+        self._add(self._log.end())
+        self.flush()
+
+
+def _receive(link: socket.socket, reader: RingReader, traffic: _TrafficFile, flight: _FlightFile) -> None:
+    """Take entries until the other side closes.
+
+    This process looks from time to time instead of waiting: handing over an entry then wakes nobody and costs the
     control process less.
     """
-    dropped = 0
 
-    def write(entries: Iterable[Entry]) -> None:
-        nonlocal dropped
-        for wall_ns, direction, raw in entries:
-            epoch_us = (wall_ns + epoch_minus_wall_ns) // 1000
-            dropped += not writer.put(encode_datagram(raw, epoch_us, direction))
+    def write(entries: Iterable[ring.Entry]) -> None:
+        for entry in entries:
+            if entry.kind in _DIRECTIONS:
+                traffic.take(entry)
+            flight.take(entry)
+        flight.flush()
+        flight.refused(reader.refused)
 
     while not select.select([link], [], [], _ROUND_S)[0]:
         write(reader.take())
     write(reader.take_rest())
-    return dropped
+    flight.end()
 
 
 def _lower_priority() -> None:
@@ -233,24 +339,35 @@ def _lower_priority() -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """The child: inherited socket, file and memory by number, and what turns monotonic into epoch nanoseconds."""
-    if len(arguments) != 4:
+    """The child: inherited socket, files and memory by number, what turns monotonic into epoch nanoseconds, and the
+    path of the flight's configuration."""
+    if len(arguments) != 6:
         print("This program is started by `companion`; it records the traffic of a flight.", file=sys.stderr)
         return 2
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     _lower_priority()
-    log = int(arguments[1])
-    reader = RingReader(int(arguments[2]))
-    with socket.socket(fileno=int(arguments[0])) as link:
-        writer = _DiskWriter(log)
+    pair, tlog, log, memory, epoch_minus_wall_ns = map(int, arguments[:5])
+    reader = RingReader(memory)
+    with socket.socket(fileno=pair) as link:
+        traffic = _TrafficFile(tlog, epoch_minus_wall_ns)
+        flight = _FlightFile(log, FlightLog(_configuration(Path(arguments[5])), epoch_minus_wall_ns))
         with contextlib.suppress(OSError):  # the control process died meanwhile: the end of the pair follows
             link.send(_READY)
-        dropped = _receive(link, reader, writer, int(arguments[3]))
-        writer.close()
+        _receive(link, reader, traffic, flight)
+        traffic.writer.close()
+        flight.writer.close()
         with contextlib.suppress(OSError):  # nobody listens when the control process died
-            link.send(_REPORT.pack(reader.taken - dropped, dropped))
-    return 0 if writer.error is None else 1
+            link.send(_REPORT.pack(traffic.taken, traffic.dropped, flight.missing))
+    return _FAILED_TLOG * (traffic.writer.error is not None) | _FAILED_ULOG * (flight.writer.error is not None)
+
+
+def _configuration(path: Path) -> str:
+    """The flight's configuration; a log without it is better than none."""
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
 
 
 if __name__ == "__main__":

@@ -15,19 +15,21 @@ import numpy as np
 from companion.errors import InputError
 from companion.record.charts import Array
 from companion.record.columns import LIMIT_NAMES, TRACK_PHASE
-from companion.record.figures import FIGURES, FlightData
+from companion.record.figures import FIGURES
+from companion.record.flight_data import FlightData
 from companion.record.flight_record import FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, read_summary, write_whole
 from companion.record.page import compose
 from companion.record.summary import PASSED
 
 REPORT_FILE: Final = "report.html"
+_ROTORS: Final = 4
 TRUTH_FILE: Final = "truth.csv"
 """Written by the simulated vehicle: what really happened, on the clock of the record's `t_s`."""
 
 
-def build_report(folder: Path) -> Path:
-    """Write `report.html` from what is in a flight's folder and return its path.
+def build_report(folder: Path, out: Path | None = None) -> Path:
+    """Write `report.html` (or `out`) from what is in a flight's folder and return its path.
 
     Needs `record.npz` and `summary.json`; uses `flight.toml` (thresholds, limits, gains, mass) and `truth.csv` when
     they are there.
@@ -35,6 +37,17 @@ def build_report(folder: Path) -> Path:
     Raises:
         InputError: a file is missing that must be there, or one cannot be read, or the report cannot be written.
     """
+    flight, configuration = read_flight(folder)
+    page = _page(flight_name(configuration, folder), flight, configuration)
+    path = out or folder / REPORT_FILE
+    try:
+        return write_whole(path, page)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); name another with --out") from None
+
+
+def read_flight(folder: Path) -> tuple[FlightData, dict[str, Any]]:
+    """What a flight's folder holds, and its configuration. Raises InputError."""
     record = FlightRecord.load(folder)
     summary = read_summary(folder)
     configuration = _read_configuration(folder / CONFIGURATION_FILE)
@@ -45,17 +58,13 @@ def build_report(folder: Path) -> Path:
         truth=_read_truth(folder / TRUTH_FILE),
         mass_kg=None if mass_kg is None else float(mass_kg),
         limits=_merged(configuration, "limits"),
+        thrust_full_n=_rotors(configuration)[0],
+        curve_factor=_rotors(configuration)[1],
     )
-    page = _page(_name(configuration, folder), flight, configuration)
-    try:
-        return write_whole(folder / REPORT_FILE, page)
-    except OSError as error:
-        raise InputError(
-            f"{folder / REPORT_FILE}: cannot be written ({error.strerror}); copy the folder first"
-        ) from None
+    return flight, configuration
 
 
-def _name(configuration: Mapping[str, Any], folder: Path) -> str:
+def flight_name(configuration: Mapping[str, Any], folder: Path) -> str:
     """What the flight file calls the flight, or the name of its folder."""
     flight = configuration.get("flight")
     for table in (configuration, flight if isinstance(flight, Mapping) else {}):
@@ -111,6 +120,14 @@ def _merged(configuration: Mapping[str, Any], key: str) -> dict[str, Any]:
     return merged
 
 
+def _rotors(configuration: Mapping[str, Any]) -> tuple[float | None, float]:
+    """Full thrust of all rotors [N], if known, and the factor of their thrust curve."""
+    rotors = _merged(configuration, "rotors")
+    most, curve = rotors.get("thrust_max_n"), rotors.get("curve_factor")
+    full_n = _ROTORS * float(most) if isinstance(most, int | float) else None
+    return full_n, float(curve) if isinstance(curve, int | float) else 0.0
+
+
 # --- the page --------------------------------------------------------------------------------------------------------
 
 
@@ -141,15 +158,18 @@ def _figures(flight: FlightData) -> tuple[list[dict[str, Any]], str]:
         panels = [{"key": figure.key, **figure.build(flight)}]
         if figure.close is not None and (close := figure.close(flight)) is not None:
             panels.append({"key": f"{figure.key}-close", **close})
-        plots = "".join(
-            f'<div class="plot" id="{panel["key"]}" style="height:{figure.height_px}px"></div>' for panel in panels
-        )
-        sections.append(
-            f'<section class="figure"><h2>{html.escape(figure.title)}</h2>'
-            f'<p class="caption">{html.escape(figure.caption)}</p><div class="plots">{plots}</div></section>\n'
-        )
+        sections.append(section(figure.title, figure.caption, [panel["key"] for panel in panels], figure.height_px))
         drawn += panels
     return drawn, "".join(sections)
+
+
+def section(title: str, caption: str, keys: Sequence[str], height_px: int) -> str:
+    """A figure's place on the page: a title, a caption, and an element for each of its panels."""
+    plots = "".join(f'<div class="plot" id="{key}" style="height:{height_px}px"></div>' for key in keys)
+    return (
+        f'<section class="figure"><h2>{html.escape(title)}</h2>'
+        f'<p class="caption">{html.escape(caption)}</p><div class="plots">{plots}</div></section>\n'
+    )
 
 
 def _by_law(summary: Mapping[str, Any]) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from companion.record.columns import DEFAULT_PHASE_NAMES, LIMIT_NAMES
 from companion.record.ulog import Field, Topic
 
 _SAMPLE = Field("timestamp_sample", "uint64_t", "us", "vehicle time of the state that it is of, or answers")
@@ -109,7 +110,7 @@ STATUS: Final = Topic(
     (
         Field("arming_state", "uint8_t", "", "1 disarmed, 2 armed"),
         Field("nav_state_user_intention", "uint8_t", "", "mode that was asked for, as nav_state; 31 unknown"),
-        Field("nav_state", "uint8_t", "", "mode that is flown: PX4's NAVIGATION_STATE; 4 Hold, 14 Offboard, 31 unknown"),
+        Field("nav_state", "uint8_t", "", "mode that is flown, PX4's numbers: 4 Hold, 14 Offboard, 31 unknown"),
         Field("vehicle_type", "uint8_t", "", "1 rotary wing, 0 something else"),
         Field("is_vtol", "bool", "", "never"),
         Field("system_type", "uint8_t", "", "MAV_TYPE"),
@@ -187,15 +188,14 @@ STEP: Final = Topic(
     (
         _of("t_s", "double", "s", "vehicle time of the state"),
         _of("track_s", "double", "s", "time on the trajectory; NaN outside of the track phase"),
-        _of("phase", "double", "", "0 connect, 1 preflight, 2 takeoff, 3 join, 4 track, 5 hold, 6 land"),
+        _of("phase", "double", "", ", ".join(f"{index} {name}" for index, name in enumerate(DEFAULT_PHASE_NAMES))),
         _of("state_age_ms", "double", "ms", "age of the state when it was answered"),
         _of("step_us", "double", "us", "wall time from the state's arrival to the setpoint's departure"),
         _of("late", "double", "", "1 when that took more than 20 % of the state period"),
         _of("skipped", "double", "", "states that were skipped before this one"),
-        _of("limits", "double", "", "what was limited, a sum: 1 least thrust, 2 most thrust, 4 roll or pitch rate,"
-            " 8 yaw rate, 16 disturbance at its bound, 32 estimator frozen, 64 heading held"),
+        _of("limits", "double", "", "a sum: " + ", ".join(f"{bit} {name}" for bit, name in LIMIT_NAMES.items())),
     ),
-)  # fmt: skip
+)
 STATE: Final = Topic(
     "companion_state",
     "the state that the step answered",
@@ -213,7 +213,7 @@ REFERENCE: Final = Topic(
         _vector("p", "m", "position, NED", "ref"),
         _vector("v", "m/s", "velocity, NED", "ref_v"),
         _vector("error", "m", "position less reference, NED", "error"),
-        _of("heading_error", "double", "rad", "from the heading wanted to the actual one; NaN: free", "heading_error_rad"),
+        _of("heading_error", "double", "rad", "from the heading wanted to the actual; NaN: free", "heading_error_rad"),
     ),
 )
 ERRORS: Final = Topic(

@@ -282,7 +282,7 @@ class Traffic:
     def _tell_texts(self) -> None:
         while self._texts.texts:
             announced = self._texts.texts.popleft()
-            self._say(min(max(announced.severity, 0), 7), f"autopilot: {announced.text}")
+            self._say(announced.severity, f"autopilot: {announced.text}")
 
     def _on_param_value(self, frame: Frame) -> None:
         name, value, _ = codec.decode_param_value(frame.payload)

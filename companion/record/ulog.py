@@ -153,8 +153,8 @@ def parameter(key: str, value: Number) -> bytes:
 
 
 def logged(level: int, t_us: int, text: str) -> bytes:
-    """L: a text with its severity (`Level`) and vehicle time [us]."""
-    return _message("L", _LOGGED.pack(ord("0") + level, t_us) + _clipped(text, _TEXT_MAX))
+    """L: a text with its severity (0 emergency to 7 debug, see `Level`) and vehicle time [us]."""
+    return _message("L", _LOGGED.pack(ord("0") + min(max(level, 0), 7), t_us) + _clipped(text, _TEXT_MAX))
 
 
 def sync() -> bytes:

@@ -10,15 +10,15 @@ one factor for everything between two rests.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, sqrt, tan
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from companion.trajectory.demands import Excess, Gauge
+from companion.trajectory.descent import minimise
 from companion.trajectory.minimum_snap import Knots, Solution, basis, solve
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ RATIO_MAX = 30.0
 FINE_SAMPLES = 33
 ZOOMS = 3
 ZOOM_SAMPLES = 9
-NEAR = 0.03
+NEAR = 0.02
 """Peaks that are this close to a limit are looked for between the samples."""
 
 SPREAD = (1.0, 0.8, 0.45, 0.2)
@@ -147,16 +147,9 @@ class _Round:
         start = self._start_s
         around = np.maximum(np.concatenate([[0.0], start[:-1]]), np.concatenate([start[1:], [0.0]]))
         least = np.maximum(start / CHANGE_MAX, np.minimum(start, around / RATIO_MAX))
-        bounds = list(zip(self._stretch * np.log(least / start), self._stretch * np.log(CHANGE_MAX), strict=True))
-        found = minimize(
-            self._value,
-            np.zeros_like(start),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bounds,
-            options={"maxiter": STEPS, "maxcor": 5},
-        )
-        durations_s: Array = start * np.exp(found.x / self._stretch)
+        low, high = self._stretch * np.log(least / start), self._stretch * np.log(CHANGE_MAX)
+        z = minimise(self._value, low, high, np.zeros_like(start), STEPS)
+        durations_s: Array = start * np.exp(z / self._stretch)
         return durations_s
 
     def _value(self, z: Array) -> tuple[float, Array]:
@@ -190,16 +183,22 @@ def _maps(x: Array) -> tuple[Array, Array, Array]:
     return b.values(1, x), b.values(2, x), b.values(3, x)
 
 
-def _derivatives(solution: Solution, maps: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """Return velocity, acceleration and jerk at the samples of all pieces, each of shape (3, samples, n)."""
+def _derivatives(solution: Solution, maps: Sequence[Array]) -> list[Array]:
+    """Return velocity, acceleration, ... at the samples of all pieces, as many as maps, each of shape
+    (3, samples, n)."""
     y, t = solution.local(), solution.durations_s
-    return maps[0] @ y / t, maps[1] @ y / t**2, maps[2] @ y / t**3
+    return [back @ y / t**k for k, back in enumerate(maps, start=1)]
+
+
+def _largest(gauge: Gauge, v: Array, a: Array, j: Array, s: Array) -> Array:
+    """Return the largest excess over any limit, torque included."""
+    return np.maximum(np.maximum.reduce(gauge.excess(v, a, j)[0]), gauge.torque_excess(v, a, j, s))
 
 
 def worst(solution: Solution, gauge: Gauge, zooms: int = ZOOMS) -> Array:
     """Return the largest excess over any limit in each piece, with `zooms` on the peaks between samples; shape (n,)."""
     x = np.linspace(0.0, 1.0, FINE_SAMPLES)
-    excess = np.maximum.reduce(gauge.excess(*_derivatives(solution, _maps(x)))[0])
+    excess = _largest(gauge, *_derivatives(solution, (*_maps(x), basis(4).values(4, x))))
     rising, falling = np.full_like(excess, True, dtype=bool), np.full_like(excess, True, dtype=bool)
     rising[1:] = excess[1:] >= excess[:-1]
     falling[:-1] = excess[:-1] >= excess[1:]
@@ -209,7 +208,7 @@ def worst(solution: Solution, gauge: Gauge, zooms: int = ZOOMS) -> Array:
     middle, reach, t = x[at], 1.0 / (FINE_SAMPLES - 1), solution.durations_s[piece]
     for _ in range(zooms if len(piece) else 0):
         around = np.clip(middle + reach * np.linspace(-1.0, 1.0, ZOOM_SAMPLES)[:, None], 0.0, 1.0)
-        values = np.maximum.reduce(gauge.excess(*_horner(coefficients, around, t))[0])
+        values = _largest(gauge, *_horner(coefficients, around, t))
         best = values.argmax(0)
         middle = around[best, np.arange(len(piece))]
         np.maximum.at(found, piece, values.max(0))
@@ -217,14 +216,14 @@ def worst(solution: Solution, gauge: Gauge, zooms: int = ZOOMS) -> Array:
     return found
 
 
-def _horner(c: Array, x: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Return velocity, acceleration and jerk (3, samples, n) of coefficients (3, 10, n) at x (samples, n)."""
-    rows = [np.zeros((3, *x.shape)) for _ in range(4)]
+def _horner(c: Array, x: Array, t: Array) -> tuple[Array, Array, Array, Array]:
+    """Return velocity, acceleration, jerk and snap (3, samples, n) of coefficients (3, 10, n) at x (samples, n)."""
+    rows = [np.zeros((3, *x.shape)) for _ in range(5)]
     for k in range(c.shape[1] - 1, -1, -1):
-        for i in (3, 2, 1):
+        for i in (4, 3, 2, 1):
             rows[i] = rows[i] * x + rows[i - 1]
         rows[0] = rows[0] * x + c[:, k, None]
-    return rows[1] / t, 2.0 * rows[2] / t**2, 6.0 * rows[3] / t**3
+    return rows[1] / t, 2.0 * rows[2] / t**2, 6.0 * rows[3] / t**3, 24.0 * rows[4] / t**4
 
 
 def settle(durations_s: Array, knots: Knots, gauge: Gauge, turn: Turn | None, progress: Progress) -> Allocation:

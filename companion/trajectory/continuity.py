@@ -8,11 +8,16 @@ below. Declared joints are compared by their exact values.
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
-from math import dist, hypot, isfinite, pi, remainder
+from math import dist, hypot, pi, remainder
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.control.types import Reference
+from companion.trajectory.batch import Batch
 from companion.trajectory.pieces import Piece
 
 JUMP_TOLERANCE = 1e-5
@@ -44,6 +49,9 @@ YAW_UNITS = ("rad", "rad/s", "rad/s^2")
 Levels = tuple[tuple[float, ...], ...]
 """One quantity with its derivatives, each as a vector."""
 
+Rows = tuple[NDArray[np.float64], ...]
+"""The same over a scan of n instants, each of shape (components, n)."""
+
 
 class Finding(NamedTuple):
     """Something that is wrong with a reference's derivatives."""
@@ -65,6 +73,7 @@ class _Channel(NamedTuple):
     names: tuple[str, ...]
     units: tuple[str, ...]
     levels: Callable[[Reference], Levels]
+    rows: Callable[[Batch], Rows]
     wraps: bool
     jumps: int
     """How many of the levels must not jump: up to jerk, up to the heading's rate."""
@@ -78,24 +87,32 @@ def _yaw_levels(r: Reference) -> Levels:
     return (r.yaw,), (r.yaw_rate,), (r.yaw_acceleration,)
 
 
+def _position_rows(scan: Batch) -> Rows:
+    return scan[:5]
+
+
+def _yaw_rows(scan: Batch) -> Rows:
+    return tuple(scan.yaw[:, None])
+
+
 _CHANNELS = (
-    _Channel(NAMES, UNITS, _position_levels, False, 4),
-    _Channel(YAW_NAMES, YAW_UNITS, _yaw_levels, True, 2),
+    _Channel(NAMES, UNITS, _position_levels, _position_rows, False, 4),
+    _Channel(YAW_NAMES, YAW_UNITS, _yaw_levels, _yaw_rows, True, 2),
 )
 
 
-def findings(piece: Piece, times_s: Sequence[float], references: Sequence[Reference]) -> list[Finding]:
+def findings(piece: Piece, times_s: Sequence[float], scan: Batch) -> list[Finding]:
     """Return what is wrong with a piece's derivatives, the first instance of each kind.
 
     Args:
         piece: what to look at.
         times_s: an increasing grid over the time that counts, fine enough to follow the reference [s].
-        references: the piece at these times, all finite.
+        scan: the piece at these times, all finite.
 
     """
     found: list[Finding] = []
     for channel in _CHANNELS:
-        rows = [channel.levels(reference) for reference in references]
+        rows = channel.rows(scan)
         scales = _scales(rows, channel.wraps)
         jumps = _joint_jumps(piece, channel, scales, times_s[-1]) + _grid_jumps(piece, channel, scales, times_s, rows)
         found += _first_of_each(jumps)
@@ -105,11 +122,15 @@ def findings(piece: Piece, times_s: Sequence[float], references: Sequence[Refere
     return found
 
 
-def _scales(rows: Sequence[Levels], wraps: bool) -> list[float]:
+def _scales(rows: Rows, wraps: bool) -> list[float]:
     """Return the size of each level over the grid: the largest length, of the lowest the largest way from its start."""
-    first = rows[0][0]
-    lowest = pi if wraps else max(dist(row[0], first) for row in rows)
-    return [lowest, *(max(hypot(*row[k]) for row in rows) for k in range(1, len(rows[0])))]
+    lowest = pi if wraps else _longest(rows[0] - rows[0][:, :1])
+    return [lowest, *(_longest(row) for row in rows[1:])]
+
+
+def _longest(row: NDArray[np.float64]) -> float:
+    size = float(np.abs(row).max())
+    return size * float(np.sqrt(((row / size) ** 2).sum(0).max())) if size > 0.0 else 0.0
 
 
 def _limit(share: float, scale: float) -> float:
@@ -148,20 +169,32 @@ def _residual(channel: _Channel, k: int, step_s: float, a: Levels, b: Levels) ->
 
 
 def _grid_jumps(
-    piece: Piece, channel: _Channel, scales: Sequence[float], times_s: Sequence[float], rows: Sequence[Levels]
+    piece: Piece, channel: _Channel, scales: Sequence[float], times_s: Sequence[float], rows: Rows
 ) -> list[Finding]:
     """Look for jumps in every interval of the grid."""
     found: list[Finding] = []
+    steps_s = np.diff(times_s)
     for k in range(channel.jumps):
         limit = _limit(JUMP_TOLERANCE, scales[k])
-        steps = range(len(times_s) - 1)
-        firsts = [_residual(channel, k, times_s[i + 1] - times_s[i], rows[i], rows[i + 1]) for i in steps]
-        suspects = sorted((i for i in steps if firsts[i] > limit), key=firsts.__getitem__, reverse=True)
-        for i in suspects[:SUSPECTS_MAX]:
+        firsts = _residuals(channel, k, steps_s, rows)
+        above = np.flatnonzero(firsts > limit)
+        for i in above[np.argsort(-firsts[above], kind="stable")][:SUSPECTS_MAX].tolist():
             at_s, last = _halved(piece, channel, k, times_s[i], times_s[i + 1])
             if last > limit and last > JUMP_REMAINDER * firsts[i]:
                 found.append(Finding(channel.names[k], channel.units[k], at_s, last, limit, True))
     return found
+
+
+def _residuals(channel: _Channel, k: int, steps_s: NDArray[np.float64], rows: Rows) -> NDArray[np.float64]:
+    """Return `_residual` for all intervals of a grid."""
+    change = steps_s / 2.0 * (rows[k + 1][:, :-1] + rows[k + 1][:, 1:])
+    if k + 2 < len(rows):
+        change += steps_s * steps_s / 12.0 * (rows[k + 2][:, :-1] - rows[k + 2][:, 1:])
+    missed = rows[k][:, :-1] + change - rows[k][:, 1:]
+    if channel.wraps and k == 0:
+        missed = np.remainder(missed + pi, 2.0 * pi) - pi
+    residuals: NDArray[np.float64] = np.sqrt((missed * missed).sum(0))
+    return residuals
 
 
 def _halved(piece: Piece, channel: _Channel, k: int, low_s: float, high_s: float) -> tuple[float, float]:
@@ -182,13 +215,19 @@ def _halved(piece: Piece, channel: _Channel, k: int, low_s: float, high_s: float
 
 
 def _slopes(piece: Piece, channel: _Channel, scales: Sequence[float], times_s: Sequence[float]) -> list[Finding]:
-    """Compare every derivative with a finite difference (fourth order) of the one below, at scattered instants."""
+    """Compare every derivative with a finite difference (fourth order) of the one below, at scattered instants.
+
+    Differences across a declared joint are left out: what is beyond the fourth derivative may jump there.
+    """
     start_s, end_s = times_s[0], times_s[-1]
     step_s = (times_s[1] - times_s[0]) / 16.0
     room_s = end_s - start_s - 4.0 * step_s
+    joints_s = [joint.at_s for joint in piece.joints()]
     found = []
     for i in range(SLOPE_INSTANTS):
         t_s = start_s + 2.0 * step_s + room_s * (GOLDEN * i % 1.0)
+        if bisect_left(joints_s, t_s - 2.0 * step_s) < bisect_right(joints_s, t_s + 2.0 * step_s):
+            continue
         around = [channel.levels(piece.at(t_s + n * step_s)) for n in (-2, -1, 1, 2)]
         middle = channel.levels(piece.at(t_s))
         for k in range(1, len(middle)):
@@ -211,10 +250,3 @@ def _first_of_each(all_found: Sequence[Finding]) -> list[Finding]:
     for finding in sorted(all_found, key=lambda f: f.at_s):
         kept.setdefault(finding.name, finding)
     return list(kept.values())
-
-
-def finite(reference: Reference) -> bool:
-    """Whether all numbers of a reference are finite."""
-    vectors = (reference.p, reference.v, reference.a, reference.j, reference.s)
-    yaw = (reference.yaw, reference.yaw_rate, reference.yaw_acceleration)
-    return all(isfinite(x) for vector in (*vectors, yaw) for x in vector)

@@ -4,21 +4,16 @@ define."""
 from __future__ import annotations
 
 from abc import abstractmethod
-from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from companion.config import Finite, NotNegative, Positive, Section, Vector
-from companion.errors import InputError
+from companion.config import Finite, Positive, Section, Vector
 from companion.frames import radians
 from companion.trajectory.anchored import Anchor, JoinKind
 from companion.trajectory.shapes import Circle, Heading, Helix, Hover, Lemniscate, Line, Lissajous, Shape
 
-if TYPE_CHECKING:
-    from companion.trajectory.waypoints import HeadingMode, PlanLimits, Waypoint
-
-ShapeName = Literal["hover", "line", "circle", "lemniscate", "lissajous", "helix", "waypoints"]
+ShapeName = Literal["hover", "line", "circle", "lemniscate", "lissajous", "helix"]
 
 
 def _not_zero(value: float) -> float:
@@ -51,8 +46,6 @@ class HeadingTable(Table):
 
     yaw_deg: Finite = 0.0
     yaw_rate_deg_s: Finite = 0.0
-    along_path: bool = False
-    """Of waypoints: the nose along the path."""
 
     def heading(self) -> Heading:
         """Return the heading in radians."""
@@ -193,42 +186,6 @@ class HelixTable(ShapeTable):
         )
 
 
-class WaypointTable(Table):
-    """[[waypoint]]: a point that the path goes through, and what is asked for there."""
-
-    p_m: Vector
-    yaw_deg: Finite | None = None
-    speed_m_s: Positive | None = None
-    velocity_m_s: Vector | None = None
-    stop: bool = False
-
-    def waypoint(self) -> Waypoint:
-        """Return the waypoint in radians."""
-        from companion.trajectory.waypoints import Waypoint
-
-        yaw_rad = None if self.yaw_deg is None else radians(self.yaw_deg)
-        return Waypoint(self.p_m, yaw_rad, self.speed_m_s, self.stop, self.velocity_m_s)
-
-
-class LimitsTable(Table):
-    """[limits]: what a path through waypoints keeps to, as far as it is tighter than the vehicle's own [limits]."""
-
-    speed_max_m_s: Positive | None = None
-    acceleration_max_m_s2: Positive | None = None
-    tilt_max_rad: Positive | None = None
-    thrust_min_n: Positive | None = None
-    thrust_max_n: Positive | None = None
-    rate_max_rad_s: Positive | None = None
-    heading_rate_max_rad_s: Positive | None = None
-    wind_m_s: NotNegative = 0.0
-
-    def within(self, limits: PlanLimits) -> PlanLimits:
-        """Return the tighter ones of these limits and the vehicle's."""
-        from companion.trajectory.waypoints import tightened
-
-        return tightened(limits, self.model_dump(exclude={"wind_m_s"}, exclude_none=True), self.wind_m_s)
-
-
 class Definition(Table):
     """A trajectory file as a whole."""
 
@@ -246,8 +203,6 @@ class Definition(Table):
     lemniscate: LemniscateTable | None = None
     lissajous: LissajousTable | None = None
     helix: HelixTable | None = None
-    waypoint: tuple[WaypointTable, ...] | None = None
-    limits: LimitsTable | None = None
 
     @property
     def table(self) -> ShapeTable:
@@ -255,31 +210,15 @@ class Definition(Table):
         table: ShapeTable = getattr(self, self.shape)
         return table
 
-    def built_shape(self, limits: PlanLimits | None = None) -> Shape:
-        """Return the shape that the file defines.
+    def built_shape(self) -> Shape:
+        """Return the shape that the file defines."""
+        return self.table.shape(self.heading.heading())
 
-        Args:
-            limits: of the vehicle; a path through waypoints is planned within them.
-
-        Raises:
-            InputError: waypoints without a vehicle, or one of them is wrong.
-            RefusedError: the limits leave no way through the waypoints.
-
-        """
-        if self.waypoint is None:
-            return self.table.shape(self.heading.heading())
-        if limits is None:
-            raise InputError("a path through waypoints is planned within a vehicle's limits: name a vehicle")
-        points = tuple(table.waypoint() for table in self.waypoint)
-        within = (self.limits or LimitsTable()).within(limits)
-        return _planned(
-            points, within, "path" if self.heading.along_path else "waypoints", radians(self.heading.yaw_deg)
-        )
-
-    def shape_duration_s(self, shape: Shape) -> float:
-        """Return how long the trajectory takes at a time scale of 1 with the shape that was built [s]."""
+    def shape_duration_s(self) -> float:
+        """Return how long the trajectory takes at a time scale of 1 [s]."""
         if self.duration_s is not None:
             return self.duration_s
+        shape = self.built_shape()
         period_s, own_s = shape.period_s, shape.own_duration_s
         if self.laps is not None and period_s is not None:
             return self.laps * period_s
@@ -294,62 +233,22 @@ class Definition(Table):
                 raise ValueError(f'table [{name}] is missing: shape = "{name}" needs it')
             if name != self.shape and getattr(self, name) is not None:
                 raise ValueError(f'table [{name}] does not belong here: shape = "{self.shape}"')
-        if self.shape == "waypoints":
-            return self
-        for name in ("waypoint", "limits"):
-            if getattr(self, name) is not None:
-                raise ValueError(f'{name} does not belong here: shape = "{self.shape}"; shape = "waypoints" has it')
-        if self.heading.along_path:
-            raise ValueError('heading.along_path = true: only shape = "waypoints" has it')
         place = self.table.place
         if self.anchor != "here" and place is not None and place not in self.table.model_fields_set:
             raise ValueError(f'{self.shape}.{place} is missing: anchor = "{self.anchor}" needs it (north, east, down)')
         return self
 
     @model_validator(mode="after")
-    def _waypoints(self) -> Self:
-        if self.shape != "waypoints":
-            return self
-        if not self.waypoint:
-            raise ValueError('[[waypoint]] is missing: shape = "waypoints" needs at least two')
-        for name in ("duration_s", "laps"):
-            if getattr(self, name) is not None:
-                raise ValueError(
-                    f"{name} does not belong here: how long waypoints take follows from the limits; [limits] or"
-                    " time_scale make it longer"
-                )
-        if self.heading.yaw_rate_deg_s:
-            raise ValueError(
-                f"heading.yaw_rate_deg_s = {self.heading.yaw_rate_deg_s}: waypoints turn by waypoint.N.yaw_deg, or by"
-                " heading.along_path = true"
-            )
-        if self.heading.along_path and any(table.yaw_deg is not None for table in self.waypoint):
-            raise ValueError("heading.along_path = true and waypoint.N.yaw_deg exclude each other; give one of them")
-        return self
-
-    @model_validator(mode="after")
     def _one_end(self) -> Self:
-        if self.shape == "waypoints":
-            return self
         if self.duration_s is not None and self.laps is not None:
             raise ValueError(
                 f"duration_s = {self.duration_s} and laps = {self.laps} exclude each other; give one of them"
             )
-        shape = self.built_shape()
-        if self.laps is not None and shape.period_s is None:
+        if self.laps is not None and self.built_shape().period_s is None:
             hint = "; line.back = true makes it go there and back" if self.shape == "line" else ""
             raise ValueError(f"laps = {self.laps}: this {self.shape} does not repeat; give duration_s instead{hint}")
-        self.shape_duration_s(shape)
+        self.shape_duration_s()
         return self
-
-
-@lru_cache(maxsize=4)
-def _planned(points: tuple[Waypoint, ...], limits: PlanLimits, heading: HeadingMode, yaw_rad: float) -> Shape:
-    """Plan once what is asked for again and again: by the gates, by the flight."""
-    # Imported late: the planner needs scipy, which takes longer to import than most commands run.
-    from companion.trajectory.waypoints import plan
-
-    return plan(points, limits, heading=heading, yaw_rad=yaw_rad)
 
 
 def _without_end(shape: str, period_s: float | None) -> str:

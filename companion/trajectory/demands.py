@@ -3,7 +3,7 @@ arrays, with room for wind, and with gradients for the search for times."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.trajectory.flatness import PointMass, ReferenceLimits
+from companion.trajectory.torque import Body
 
 Array = NDArray[np.float64]
 
@@ -71,6 +72,7 @@ class Gauge:
     limits: ReferenceLimits
     model: PointMass
     disturbance_m_s2: float = 0.0
+    body: Body | None = None
 
     def excess(self, v: Array, a: Array, j: Array) -> tuple[Excess, Parts]:
         """Return the excess of instants with these derivatives, each of shape (3, ...) in NED."""
@@ -95,6 +97,22 @@ class Gauge:
         )
         return excess, Parts(v, a, speed, acceleration, f, level, r, along, across, turn)
 
+    def torque_excess(self, v: Array, a: Array, j: Array, s: Array) -> Array:
+        """Return by what share the torque exceeds what the rotors have for it, as `torque.use` less one."""
+        if self.body is None:
+            return np.full(v.shape[1:], -1.0)
+        model, room = self.model, self.disturbance_m_s2
+        d = model.drag_1_s
+        f, f1, f2 = -a - d * v, -j - d * a, -s - d * j
+        f[2] += model.gravity_m_s2
+        n = _length(f) + TINY
+        r = f / n
+        n1 = _dot(r, f1)
+        turn = _length(f2 - _dot(r, f2) * r - 2.0 * n1 * ((f1 - n1 * r) / n)) / np.maximum(n - room, TINY)
+        least, most = (model.mass_kg / 4.0 * (n + change) for change in (-room, room))
+        limit = self.body.lever_m * np.maximum(np.minimum(least, self.body.rotor_max_n - most), TINY)
+        return np.asarray(self.body.inertia_kg_m2 * turn / limit - 1.0)
+
     def gradient(self, parts: Parts, weights: Excess) -> tuple[Array, Array, Array]:
         """Return the gradient over v, a and j of the sum of weights times excess."""
         lim, g, d = self.limits, self.model.gravity_m_s2, self.model.drag_1_s
@@ -109,6 +127,19 @@ class Gauge:
         over_v = (weights.speed / (lim.speed_max_m_s * (parts.speed + TINY))) * parts.v - d * over_f
         over_a = (weights.acceleration / (lim.acceleration_max_m_s2 * (parts.acceleration + TINY))) * parts.a
         return over_v, over_a - over_f - d * over_f1, -over_f1
+
+
+def eased(gauge: Gauge, share: float) -> Gauge:
+    """Return a gauge that lets a share of speed, acceleration, tilt and body rate be used."""
+    lim = gauge.limits
+    limits = replace(
+        lim,
+        speed_max_m_s=share * lim.speed_max_m_s,
+        acceleration_max_m_s2=share * lim.acceleration_max_m_s2,
+        tilt_max_rad=share * lim.tilt_max_rad,
+        rate_max_rad_s=share * lim.rate_max_rad_s,
+    )
+    return replace(gauge, limits=limits)
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from enum import StrEnum
-from math import floor, log10
+from math import copysign, floor, log10
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.control.types import Reference
-from companion.trajectory.continuity import Finding, findings, finite
+from companion.trajectory.batch import Batch, batch, finite
+from companion.trajectory.batch import quantities as array_quantities
+from companion.trajectory.batch import uses as array_uses
+from companion.trajectory.continuity import Finding, findings
 from companion.trajectory.flatness import (
     BOUNDS,
     Bound,
@@ -88,13 +94,14 @@ def check(piece: Piece, limits: ReferenceLimits, model: PointMass) -> list[Viola
     disturbance: what the vehicle does while it settles is for a prediction to show.
     """
     times_s = grid(piece)
-    references = [piece.at(t_s) for t_s in times_s]
-    for t_s, reference in zip(times_s, references, strict=True):
-        if not finite(reference):
-            sentence = f"the reference is not a finite number at {t_s:.2f} s"
-            return [Violation(ViolationName.NOT_FINITE, float("nan"), 0.0, t_s, sentence)]
-    violations = _bound_violations(piece, times_s, references, limits, model)
-    return violations + [_wrong_derivative(finding) for finding in findings(piece, times_s, references)]
+    found = batch(piece, times_s)
+    good = finite(found)
+    if not good.all():
+        t_s = times_s[int(good.argmin())]
+        sentence = f"the reference is not a finite number at {t_s:.2f} s"
+        return [Violation(ViolationName.NOT_FINITE, float("nan"), 0.0, t_s, sentence)]
+    violations = _bound_violations(piece, times_s, found, limits, model)
+    return violations + [_wrong_derivative(finding) for finding in findings(piece, times_s, found)]
 
 
 def grid(piece: Piece) -> list[float]:
@@ -107,21 +114,22 @@ def grid(piece: Piece) -> list[float]:
 def _bound_violations(
     piece: Piece,
     times_s: Sequence[float],
-    references: Sequence[Reference],
+    found: Batch,
     limits: ReferenceLimits,
     model: PointMass,
 ) -> list[Violation]:
     """Compare each limit with the worst of its quantity, found between the samples as well."""
-    rows = [uses(quantities(reference, model), limits) for reference in references]
+    rows = array_uses(array_quantities(found, model), limits)
     exceeded = []
     for index in range(len(BOUNDS)):
-        at_s, use = _worst(piece, times_s, [row[index] for row in rows], index, limits, model)
+        at_s, use = _worst(piece, times_s, rows[index], index, limits, model)
         if use > 1.0 + USE_TOLERANCE:
             exceeded.append((index, at_s))
     if not exceeded:
         return []
     peaks = [piece.at(at_s) for _, at_s in exceeded]
-    advice = _advice(piece, [*references[:: len(references) // ADVICE_SAMPLES + 1], *peaks], limits, model)
+    some = [piece.at(t_s) for t_s in times_s[:: len(times_s) // ADVICE_SAMPLES + 1]]
+    advice = _advice(piece, [*some, *peaks], limits, model)
     return [
         _exceeded(index, at_s, quantities(reference, model)[index], limits, advice)
         for (index, at_s), reference in zip(exceeded, peaks, strict=True)
@@ -131,7 +139,7 @@ def _bound_violations(
 def _worst(
     piece: Piece,
     times_s: Sequence[float],
-    values: Sequence[float],
+    values: NDArray[np.float64],
     index: int,
     limits: ReferenceLimits,
     model: PointMass,
@@ -144,7 +152,9 @@ def _worst(
     return highest(times_s, values, use)
 
 
-def highest(times_s: Sequence[float], values: Sequence[float], f: Callable[[float], float]) -> tuple[float, float]:
+def highest(
+    times_s: Sequence[float], values: Sequence[float] | NDArray[np.float64], f: Callable[[float], float]
+) -> tuple[float, float]:
     """Return when a function of time is largest [s], and its value there.
 
     Args:
@@ -153,14 +163,16 @@ def highest(times_s: Sequence[float], values: Sequence[float], f: Callable[[floa
         f: the function, for the highest peaks to be found between the instants.
 
     """
-    last = len(values) - 1
-    peaks = [i for i in range(last + 1) if values[i] >= values[max(i - 1, 0)] and values[i] >= values[min(i + 1, last)]]
-    top = max(values) * (1.0 - 1e-9)
-    best = next(i for i in range(last + 1) if values[i] >= top)
-    worst = (times_s[best], values[best])
-    if min(values) >= top:
+    v = np.asarray(values, dtype=float)
+    last = len(v) - 1
+    before, after = np.concatenate([v[:1], v[:-1]]), np.concatenate([v[1:], v[-1:]])
+    peaks = np.flatnonzero((v >= before) & (v >= after))
+    top = v.max() * (1.0 - copysign(1e-9, v.max()))  # infinite stays infinite
+    best = int((v >= top).argmax())
+    worst = (times_s[best], float(v[best]))
+    if v.min() >= top:
         return worst
-    for i in sorted(peaks, key=values.__getitem__, reverse=True)[:PEAKS_REFINED]:
+    for i in peaks[np.argsort(-v[peaks], kind="stable")][:PEAKS_REFINED].tolist():
         refined = golden_maximum(f, times_s[max(i - 1, 0)], times_s[min(i + 1, last)])
         worst = max(worst, refined, key=lambda found: found[1])
     return worst

@@ -14,8 +14,7 @@ from companion.trajectory.definition import Table
 from companion.trajectory.files import Options
 from companion.trajectory.formats import NAMES
 from companion.trajectory.formats.contents import Leg, Route
-from companion.trajectory.vehicle_limits import point_mass, reference_limits
-from companion.trajectory.waypoints import HeadingMode, PlanLimits, Waypoint
+from companion.trajectory.waypoints import HeadingMode, PlanLimits, Waypoint, plan_limits
 
 WAYPOINTS_MAX = 5000
 Latitude = Annotated[float, Field(ge=-90.0, le=90.0)]
@@ -23,27 +22,43 @@ Longitude = Annotated[float, Field(ge=-180.0, le=180.0)]
 Altitude = Annotated[float, Field(ge=-9000.0, le=9000.0)]
 
 
-class PlanTable(Table):
-    """[plan]: how a path through points is planned."""
+class LimitsTable(Table):
+    """[limits]: what a path through points keeps to, as far as it is tighter than the vehicle's own [limits]."""
 
-    heading: HeadingMode | None = None
-    """"waypoints": as they say; "path": nose along the path. Default: as they say if one does, else along the path."""
     speed_max_m_s: Positive | None = None
-    """Less than the vehicle's limit."""
     acceleration_max_m_s2: Positive | None = None
-    """Less than the vehicle's limit."""
+    tilt_max_rad: Positive | None = None
+    thrust_min_n: Positive | None = None
+    thrust_max_n: Positive | None = None
+    rate_max_rad_s: Positive | None = None
+    heading_rate_max_rad_s: Positive | None = None
     wind_m_s: NotNegative = 0.0
     """Wind from any side that is left room for."""
 
-    def limits(self, vehicle: Vehicle) -> PlanLimits:
-        """Return what is planned within: the vehicle's limits, and these."""
-        limits = reference_limits(vehicle)
-        speed, acceleration = self.speed_max_m_s, self.acceleration_max_m_s2
-        if speed is not None:
-            limits = replace(limits, speed_max_m_s=min(limits.speed_max_m_s, speed))
-        if acceleration is not None:
-            limits = replace(limits, acceleration_max_m_s2=min(limits.acceleration_max_m_s2, acceleration))
-        return PlanLimits(limits, point_mass(vehicle), self.wind_m_s)
+    def within(self, vehicle: Vehicle) -> PlanLimits:
+        """Return the tighter ones of these limits and the vehicle's."""
+        plain = plan_limits(vehicle, self.wind_m_s)
+        limits = plain.reference
+        for name, value in self.model_dump(exclude={"wind_m_s"}, exclude_none=True).items():
+            tighter = max if name == "thrust_min_n" else min
+            limits = replace(limits, **{name: tighter(getattr(limits, name), value)})
+        return replace(plain, reference=limits)
+
+
+class HeadingTable(Table):
+    """[heading]: followed where the vehicle's heading is "commanded"."""
+
+    yaw_deg: Finite = 0.0
+    """Where the file says none."""
+    along_path: bool | None = None
+    """Of paths through points: the nose along the path. Default: where no point has a heading."""
+
+    @property
+    def mode(self) -> HeadingMode | None:
+        """Return where the heading comes from; None: the points decide."""
+        if self.along_path is None:
+            return None
+        return "path" if self.along_path else "waypoints"
 
 
 class PlacedTable(Table):
@@ -53,7 +68,8 @@ class PlacedTable(Table):
     anchor_yaw_deg: Finite = 0.0
     join: JoinKind = "smooth"
     time_scale: Positive = 1.0
-    plan: PlanTable = PlanTable()
+    heading: HeadingTable = HeadingTable()
+    limits: LimitsTable = LimitsTable()
 
 
 class WaypointTable(Table):
@@ -122,7 +138,8 @@ class FileDefinition(PlacedTable):
             frame=self.frame,
             format=self.format,
             smooth_m=self.smooth_m,
-            limits=None if vehicle is None else self.plan.limits(vehicle),
-            heading=self.plan.heading,
+            limits=None if vehicle is None else self.limits.within(vehicle),
+            heading=self.heading.mode,
+            yaw_rad=radians(self.heading.yaw_deg),
             origin=None if self.origin is None else GeoPoint(*self.origin),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import hypot
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,16 @@ from companion.frames import Frame, GeoPoint, ned_from_geo
 from companion.trajectory.anchored import Origin
 from companion.trajectory.earth import APART_MAX_M
 from companion.trajectory.fence import Fence, moved
-from companion.trajectory.fit import REST_ACCELERATION, REST_SPEED, Curve, fit
 from companion.trajectory.formats import parse
 from companion.trajectory.formats.contents import Content, Polynomials, Route, Sampled
 from companion.trajectory.formats.reading import Source
 from companion.trajectory.piecewise import PathPiece, Piecewise
 from companion.trajectory.route import planned
-from companion.trajectory.shapes import Shape
+from companion.trajectory.shapes import Heading, Shape
 from companion.trajectory.waypoints import HeadingMode, PlanLimits
+
+if TYPE_CHECKING:
+    from companion.trajectory.fit import Curve
 
 VELOCITY_SHARE_MAX = 0.5
 VELOCITY_FLOOR_M_S = 0.5
@@ -45,6 +47,8 @@ class Options:
     """Of waypoint files: what the path is planned within."""
     heading: HeadingMode | None = None
     """Of waypoint files."""
+    yaw_rad: float = 0.0
+    """Heading where the file says none."""
     origin: GeoPoint | None = None
     """Of missions: count coordinates from here."""
 
@@ -77,7 +81,7 @@ def shape_of(source: Source, suffix: str, options: Options) -> Made:
     if isinstance(content, Polynomials):
         return Made(content.shape, content.shape.own_duration_s, content.notes)
     if isinstance(content, Sampled):
-        return _fitted(source, content, options.smooth_m)
+        return _fitted(source, content, options)
     return _routed(source, content, options)
 
 
@@ -89,7 +93,7 @@ def _routed(source: Source, route: Route, options: Options) -> Made:
     if options.origin is not None:
         route = _counted_from(source, route, options.origin)
     try:
-        shape, notes = planned(route, options.limits, options.heading)
+        shape, notes = planned(route, options.limits, options.heading, options.yaw_rad)
     except InputError as error:
         raise InputError(f"{source.name}: {error}") from None
     except RefusedError as error:
@@ -122,13 +126,20 @@ def _counted_from(source: Source, route: Route, origin: GeoPoint) -> Route:
     return replace(route, legs=legs, origin=origin, fence=fence)
 
 
-def _fitted(source: Source, samples: Sampled, smooth_m: float | None) -> Made:
+def _fitted(source: Source, samples: Sampled, options: Options) -> Made:
     """Return the spline along samples."""
-    path = fit(samples.t_s, samples.p_m, distance_max=smooth_m, rest=_rests(samples))
-    yaw = None if samples.yaw_rad is None else fit(samples.t_s, samples.yaw_rad[:, None])
+    # Imported late: it needs scipy, which takes longer to import than most commands run.
+    from companion.trajectory.fit import UnfitError, fit
+
+    try:
+        path = fit(samples.t_s, samples.p_m, distance_max=options.smooth_m, rest=_rests(samples))
+        yaw = None if samples.yaw_rad is None else fit(samples.t_s, samples.yaw_rad[:, None])
+    except UnfitError as error:
+        raise InputError(f"{source.name}: {error}") from None
     if not all(np.isfinite(piece).all() for curve in (path, yaw) if curve is not None for piece in curve.pieces):
         raise InputError(f"{source.name}: no spline goes along its samples; are their times or positions mixed up?")
     shape = Piecewise(
+        heading=Heading(options.yaw_rad),
         knots_s=path.knots_s,
         pieces=tuple(PathPiece(*axes) for axes in path.pieces),
         yaw_knots_s=() if yaw is None else yaw.knots_s,
@@ -140,6 +151,8 @@ def _fitted(source: Source, samples: Sampled, smooth_m: float | None) -> Made:
 
 def _rests(samples: Sampled) -> tuple[bool | None, bool | None]:
     """Whether it is at rest at its ends, where the file's velocities and accelerations say it."""
+    from companion.trajectory.fit import REST_ACCELERATION, REST_SPEED
+
     if samples.v_m_s is None or samples.a_m_s2 is None:
         return None, None
     slow = [

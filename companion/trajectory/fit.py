@@ -67,6 +67,10 @@ REST_ACCELERATION = 0.2
 """Below both (SI) an end counts as at rest."""
 
 
+class UnfitError(ValueError):
+    """Samples that do not determine a spline."""
+
+
 class Curve(NamedTuple):
     """A spline as polynomials, for one or several quantities; times from the first sample on."""
 
@@ -133,6 +137,9 @@ def fit(
         distance_max: stay within this of every sample, and be as smooth as that allows; None: let the samples decide.
         rest: whether it is at rest at the start and at the end; None: let the samples decide.
 
+    Raises:
+        UnfitError: the samples do not determine one.
+
     """
     local = t_s - t_s[0]
     offset = values.mean(axis=0)
@@ -174,9 +181,11 @@ def _chosen(t_s: Array, values: Array, rest: tuple[bool, bool], distance_max: fl
     if found is not None and found.largest <= limit:
         return found
     exact = _fitted(t_s, values, len(t_s) - 1, rest)
+    if found is None and exact is None:
+        raise UnfitError("no spline follows from these samples: their times are too uneven")
     if found is not None and (exact is None or (distance_max is None and _misses(t_s, values, rest) > found.gcv)):
         return found  # noise, and not a lack of samples: one through most of them misses the others by more
-    assert exact is not None
+    assert exact is not None  # of the two one is there
     return exact._replace(through=True)
 
 

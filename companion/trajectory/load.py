@@ -145,7 +145,12 @@ def _through_waypoints(
     if vehicle is None:
         raise InputError(f"{source}: a path through waypoints takes a vehicle's limits to plan: name a vehicle")
     try:
-        shape, notes = planned(definition.route(), definition.plan.limits(vehicle), definition.plan.heading)
+        shape, notes = planned(
+            definition.route(),
+            definition.limits.within(vehicle),
+            definition.heading.mode,
+            radians(definition.heading.yaw_deg),
+        )
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
     except RefusedError as error:

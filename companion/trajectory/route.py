@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import accumulate, pairwise
 from math import pi, remainder
 
@@ -16,13 +17,17 @@ from companion.trajectory.polynomial import Coefficients, through
 from companion.trajectory.waypoints import HeadingMode, PlanLimits, plan
 
 
-def planned(route: Route, limits: PlanLimits, heading: HeadingMode | None = None) -> tuple[Piecewise, tuple[str, ...]]:
+@lru_cache(maxsize=8)  # the gates and the flight ask for the same path
+def planned(
+    route: Route, limits: PlanLimits, heading: HeadingMode | None = None, yaw_rad: float = 0.0
+) -> tuple[Piecewise, tuple[str, ...]]:
     """Return the near-shortest path through a route and what people should know about it.
 
     Args:
         route: at least two points.
         limits: kept throughout; the route's own speed comes on top.
         heading: None: from the waypoints where they give one, else along the path.
+        yaw_rad: the heading where waypoints are to say and none does [rad].
 
     Raises:
         InputError: a waypoint is wrong.
@@ -34,7 +39,7 @@ def planned(route: Route, limits: PlanLimits, heading: HeadingMode | None = None
         used = replace(limits, reference=replace(limits.reference, speed_max_m_s=route.speed_max_m_s))
     given = any(leg.waypoint.yaw_rad is not None for leg in route.legs)
     mode: HeadingMode = heading or ("waypoints" if given else "path")
-    path = joined(_with_waits(_parts(route, used, mode)))
+    path = joined(_with_waits(_parts(route, used, mode, yaw_rad)))
     notes = [
         f"planned through {len(route.legs)} points in {path.own_duration_s:.1f} s, with at most"
         f" {used.reference.speed_max_m_s:g} m/s and {used.reference.acceleration_max_m_s2:g} m/s^2"
@@ -45,11 +50,12 @@ def planned(route: Route, limits: PlanLimits, heading: HeadingMode | None = None
     return path, tuple(notes)
 
 
-def _parts(route: Route, limits: PlanLimits, heading: HeadingMode) -> list[tuple[Leg, Piecewise | None]]:
+def _parts(
+    route: Route, limits: PlanLimits, heading: HeadingMode, yaw_rad: float
+) -> list[tuple[Leg, Piecewise | None]]:
     """Return the points at which the path rests for a time, or begins, each with the path from there to the next."""
     rests = [0, *(i for i, leg in enumerate(route.legs) if leg.hold_s > 0.0 and i), len(route.legs) - 1]
     found: list[tuple[Leg, Piecewise | None]] = []
-    yaw_rad = 0.0
     for begin, end in pairwise(dict.fromkeys(rests)):
         points = [leg.waypoint for leg in route.legs[begin : end + 1]]
         if begin and heading == "waypoints":

@@ -70,7 +70,8 @@ def _peaks(rows: Array) -> Array:
     before, middle, after = (rows[best + i, columns] for i in (-1, 0, 1))
     bend = np.minimum(before - 2.0 * middle + after, -1e-300)
     vertex: Array = np.where(np.abs(after - before) < -2.0 * bend, middle - (after - before) ** 2 / (8.0 * bend), 0.0)
-    return np.maximum(vertex, rows.max(0))
+    peaks: Array = np.maximum(vertex, rows.max(0))
+    return peaks
 
 
 def through(knots_s: Array, yaw_rad: Array) -> Turning:

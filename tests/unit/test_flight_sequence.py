@@ -70,8 +70,16 @@ class FakeOperations:
 class Script:
     """A sequence with its surroundings, past the preflight checks."""
 
-    def __init__(self, *, landed: LandedState = LandedState.IN_AIR, armed: bool = True, after: str = "hold") -> None:
-        trajectory = {"name": "hover", "shape": "hover", "duration_s": 1.0, "hover": {"point_m": [0.0, 0.0, 0.0]}}
+    def __init__(
+        self,
+        *,
+        landed: LandedState = LandedState.IN_AIR,
+        armed: bool = True,
+        after: str = "hold",
+        duration_s: float = 1.0,
+    ) -> None:
+        hover = {"point_m": [0.0, 0.0, 0.0]}
+        trajectory = {"name": "hover", "shape": "hover", "duration_s": duration_s, "hover": hover}
         data = {"name": "test", "vehicle": "paper", "trajectory": trajectory, "after": after}
         flight = build_flight(data, "test")
         self.ops = FakeOperations()

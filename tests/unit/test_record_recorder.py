@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -11,10 +12,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import ulog_reader
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink2
+from record_cases import row
 
 from companion.errors import InputError
+from companion.record.flight_record import FlightRecord
 from companion.record.recorder import Recorder, _DiskWriter
 from companion.record.tlog import Direction, encode_datagram, read_tlog
 
@@ -25,6 +29,30 @@ def frame(sequence: int = 0) -> bytes:
     link = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
     link.seq = sequence % 256
     return mavlink2.MAVLink_heartbeat_message(2, 12, 81, 0, 4, 3).pack(link)
+
+
+def state(t_us: int) -> bytes:
+    link = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
+    none = [0.0] * 21
+    message = mavlink2.MAVLink_odometry_message(t_us, 1, 1, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, none, none)
+    return bytes(message.pack(link))
+
+
+def offer_steps(recorder: Recorder, record: FlightRecord, count: int) -> None:
+    """States and rows as a flight gives them, from 1 s on."""
+    record.sink = recorder.offer_row
+    for index in range(count):
+        t_us = 1_000_000 + 4000 * index
+        recorder.offer(Direction.IN, state(t_us), time.monotonic_ns())
+        record.append(row(t_s=1e-6 * t_us, phase=4.0, e1_n=float(index)))
+
+
+def logged_steps(folder: Path) -> list[float]:
+    """e1 north of the steps in a flight's log."""
+    try:
+        return [record[1] for record in ulog_reader.read(folder / "flight.ulg").data.get("companion_errors", [])]
+    except (AssertionError, OSError):  # not begun yet
+        return []
 
 
 def until(condition: Callable[[], bool]) -> bool:
@@ -38,7 +66,8 @@ def until(condition: Callable[[], bool]) -> bool:
 
 
 @pytest.fixture
-def recorder(tmp_path) -> Iterator[Recorder]:
+def recorder(tmp_path, monkeypatch) -> Iterator[Recorder]:
+    monkeypatch.setattr("companion.record.recorder._RING_BYTES", 1 << 20)
     recorder = Recorder.start(tmp_path)
     yield recorder
     with contextlib.suppress(ProcessLookupError):
@@ -91,7 +120,7 @@ def test_a_full_buffer_drops_and_counts_instead_of_blocking(tmp_path, recorder):
     assert recorder.recorded == offered - 10
     assert len(list(read_tlog(tmp_path / "link.tlog"))) == 50 * (offered - 10)
     assert recorder.problem is not None
-    assert "10 datagrams are missing" in recorder.problem
+    assert "10 entries are missing" in recorder.problem
 
 
 def test_a_recorder_that_dies_does_not_disturb_the_flight(recorder):
@@ -129,6 +158,7 @@ recorder = Recorder.start(Path(sys.argv[1]))
 raw = bytes.fromhex(sys.argv[2])
 for index in range(300):
     recorder.offer(0, raw, time.monotonic_ns())
+recorder.note("the last words")
 print(recorder._process.pid, flush=True)
 time.sleep(60)
 """
@@ -142,6 +172,9 @@ def test_the_log_survives_the_death_of_the_control_process(tmp_path):
         control.send_signal(signal.SIGKILL)
     assert until(lambda: _ended(child))
     assert [entry.raw for entry in read_tlog(tmp_path / "link.tlog")] == [frame()] * 300
+    log = ulog_reader.read(tmp_path / "flight.ulg")
+    assert log.left_over == 0
+    assert log.texts[-1] == (5, 0, "the last words")
 
 
 def _ended(pid: int) -> bool:
@@ -157,20 +190,72 @@ def test_a_log_is_never_overwritten(tmp_path):
     with pytest.raises(InputError, match=r"link\.tlog: cannot be created \(File exists\)"):
         Recorder.start(tmp_path)
     assert (tmp_path / "link.tlog").read_bytes() == b"another flight"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "flight.ulg").write_bytes(b"another flight")
+    with pytest.raises(InputError, match=r"flight\.ulg: cannot be created \(File exists\)"):
+        Recorder.start(tmp_path / "other")
     with pytest.raises(InputError, match="No such file or directory"):
         Recorder.start(tmp_path / "missing")
 
 
 def test_a_full_disk_is_said_once_and_ends_the_writing(capfd):
     full = os.open("/dev/full", os.O_WRONLY)
-    writer = _DiskWriter(full)
+    writer = _DiskWriter(full, "link.tlog")
     entry = encode_datagram(frame(), 4, Direction.IN)
     assert writer.put(entry)
     assert until(lambda: writer.error is not None)
     assert not writer.put(entry)
     writer.close()
     os.close(full)
-    assert capfd.readouterr().err == "link.tlog: No space left on device; no more traffic is recorded\n"
+    said = "link.tlog: No space left on device; nothing more is written, the flight goes on\n"
+    assert capfd.readouterr().err == said
+
+
+def test_a_flight_and_its_words_are_in_its_log(tmp_path, recorder):
+    record = FlightRecord(60)
+    recorder.note("connect: heard the autopilot")
+    recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    offer_steps(recorder, record, 100)
+    recorder.note("the flight ended", 3)
+    recorder.close()
+    assert (recorder.dropped, recorder.problem, record.overflow) == (0, None, 40)
+    assert logged_steps(tmp_path) == [float(index) for index in range(100)]
+    log = ulog_reader.read(tmp_path / "flight.ulg")
+    assert [text for level, _, text in log.texts if level != 6] == ["connect: heard the autopilot", "the flight ended"]
+    assert log.texts[-1][:2] == (3, 1_396_000)
+    assert len(log.data["vehicle_attitude"]) == 100
+
+
+def test_a_killed_recorder_leaves_a_log_up_to_the_last_second(tmp_path, recorder):
+    recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    offer_steps(recorder, FlightRecord(100), 100)
+    assert until(lambda: len(logged_steps(tmp_path)) == 100)
+    recorder._process.kill()
+    recorder._process.wait()
+    offer_steps(recorder, FlightRecord(10), 10)
+    recorder.close()
+    assert logged_steps(tmp_path) == [float(index) for index in range(100)]
+    assert recorder.problem is not None
+    assert "flight.ulg" in recorder.problem
+
+
+def test_a_full_disk_leaves_logs_that_can_be_read(tmp_path, capfd):
+    """A limit of the files' size acts on the recorder like a disk that is full."""
+    recorder = Recorder.start(tmp_path)
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (50_000, resource.RLIM_INFINITY))
+    record = FlightRecord(500)
+    recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    offer_steps(recorder, record, 500)
+    recorder.close()
+    assert len(record) == 500
+    assert recorder.problem == "link.tlog, flight.ulg: incomplete, the disk did not take everything"
+    said = capfd.readouterr().err.splitlines()
+    assert sorted(line.partition(":")[0] for line in said) == ["flight.ulg", "link.tlog"]
+    assert all(line.endswith("nothing more is written, the flight goes on") for line in said)
+    steps = logged_steps(tmp_path)
+    assert steps == [float(index) for index in range(len(steps))]
+    assert 0 < len(steps) < 500
+    assert 0 < len(list(read_tlog(tmp_path / "link.tlog"))) < 501
 
 
 def test_started_by_hand_it_explains_itself():

@@ -12,6 +12,7 @@ from record_cases import DISTURBANCE, MASS_KG, PHASES, synthetic_flight, write_t
 
 from companion.errors import InputError
 from companion.record.charts import thin
+from companion.record.compare import build_comparison, table
 from companion.record.figures import FIGURES
 from companion.record.flight_record import FlightRecord
 from companion.record.folder import write_configuration, write_summary
@@ -28,7 +29,10 @@ CONFIGURATION = {
     },
     "limits": {"thrust_max_n": 70.0},
 }
-ALL = ["position-error", "plan-view", "plan-view-close", "body-velocities", "force-estimates", "errors", "actuation"]
+ALL = [
+    *("events", "position-error", "plan-view", "plan-view-close", "path", "body-velocities", "force-estimates"),
+    *("errors", "actuation", "rates", "attitude", "heading", "timing"),
+]
 
 
 class Page(HTMLParser):
@@ -112,10 +116,12 @@ def test_every_figure_has_its_place_and_plotly_accepts_it(page):
 
 
 def test_every_axis_says_its_unit(page):
-    for figure in page.figures.values():
-        axes = [value for key, value in figure["layout"].items() if key.startswith(("xaxis", "yaxis"))]
-        assert len(axes) >= 2
-        assert all(axis["title"]["text"].endswith("]") for axis in axes)
+    for key, figure in page.figures.items():
+        layout = figure["layout"] | figure["layout"].get("scene", {})
+        axes = [value for name, value in layout.items() if name.startswith(("xaxis", "yaxis", "zaxis"))]
+        named = [axis for axis in axes if axis.get("type") != "category"]
+        assert len(named) >= (1 if key == "events" else 2)
+        assert all(axis["title"]["text"].endswith("]") for axis in named)
 
 
 def test_titles_captions_and_numbers_are_on_the_page(page, record):
@@ -167,6 +173,32 @@ def test_phases_are_marked_in_time_figures(page):
     assert shaded == [pytest.approx((-3.0, 0.0)), pytest.approx((60.0, 65.0), abs=0.01)]
     assert [note["text"] for note in layout["annotations"]] == ["track"]
     assert "OFFBOARD confirmed" in layout["annotations"][0]["hovertext"]
+
+
+def test_events_are_bands_in_time(page, record):
+    bars = {trace["name"]: trace for trace in page.figures["events"]["data"] if trace["name"] != "phase"}
+    assert "thrust at its maximum" in bars
+    begin, length = bars["thrust at its maximum"]["base"][0], bars["thrust at its maximum"]["x"][0]
+    bits = record.column("limits")
+    active = record.column("t_s")[(np.where(np.isfinite(bits), bits, 0).astype(int) & 2) != 0]
+    assert begin == pytest.approx(active[0] - 104.0, abs=1e-6)
+    assert 0.0 < length <= active[-1] - active[0] + 0.1
+    phases = [trace for trace in page.figures["events"]["data"] if trace["name"] == "phase"]
+    assert [trace["text"][0] for trace in phases] == [phase.name for phase in PHASES[-len(phases) :]]
+
+
+def test_time_figures_and_no_others_are_zoomed_together(page):
+    linked = [key for key, figure in page.figures.items() if figure["layout"].get("meta") == "time"]
+    assert linked == [key for key in ALL if key not in {"plan-view", "plan-view-close", "path"}]
+    assert len({tuple(page.figures[key]["layout"]["xaxis"]["range"]) for key in linked}) == 1
+
+
+def test_the_path_in_space_is_true_to_scale_with_up_upwards(page, record):
+    figure = page.figures["path"]
+    assert figure["layout"]["scene"]["aspectmode"] == "data"
+    flown = next(trace for trace in figure["data"] if trace["name"] == "flown")
+    up = np.frombuffer(base64.b64decode(flown["z"]["bdata"]), dtype="<f4")
+    assert up.max() == pytest.approx(-record.column("p_d").min(), abs=0.05)
 
 
 def test_thin_keeps_spikes_ends_and_gaps():
@@ -236,3 +268,32 @@ def test_broken_files_are_refused_by_name(tmp_path, record, name, text, message)
 def test_a_folder_without_a_flight_is_refused(tmp_path):
     with pytest.raises(InputError, match="no flight record"):
         build_report(tmp_path)
+
+
+def test_two_flights_side_by_side(tmp_path, record):
+    law, px4 = (fill(tmp_path / name, record) for name in map(_made(tmp_path), ("law", "px4")))
+    write_configuration(law, CONFIGURATION)
+    write_configuration(px4, CONFIGURATION)
+    summary = json.loads((px4 / "summary.json").read_text()) | {"controller": "px4", "position_rms_m": 0.5}
+    write_summary(px4, summary)
+    page = Page(build_comparison(law, px4))
+    assert {"errors-a", "timing-a", "timing-b"} <= set(page.figures)
+    assert "errors-b" not in page.figures  # PX4's controller has none
+    linked = [figure["layout"]["xaxis"]["range"] for figure in page.figures.values() if figure["layout"].get("meta")]
+    assert len(linked) > 10
+    assert all(span == linked[0] for span in linked)
+    assert "position rms [cm]" in page.text
+    assert " 50 " in page.text
+    rows = table([law, px4])
+    assert [row["controller"] for row in rows] == ["law", "px4"]
+    assert rows[1]["position rms [cm]"] == pytest.approx(50.0)
+    with pytest.raises(InputError, match="cannot be written"):
+        build_comparison(law, px4, tmp_path / "missing" / "page.html")
+
+
+def _made(base):
+    def make(name):
+        (base / name).mkdir()
+        return name
+
+    return make

@@ -21,7 +21,7 @@ def counting(rows: int, capacity: int) -> FlightRecord:
 def test_columns_are_distinct_and_limits_are_single_bits():
     assert len(set(COLUMNS)) == len(COLUMNS) == 63
     assert COLUMNS[:3] == ("t_s", "track_s", "phase")
-    assert COLUMNS[-5:] == ("state_age_ms", "step_us", "late", "skipped", "limits")
+    assert COLUMNS[-12:-7] == ("state_age_ms", "step_us", "late", "skipped", "limits")
     assert list(LIMIT_NAMES) == [1, 2, 4, 8, 16, 32, 64]
 
 
@@ -109,3 +109,15 @@ def test_what_is_not_a_record_is_refused_in_one_line(tmp_path):
     np.savez(path, format=1, columns=np.array(["t_s"]), phase_names=np.array(["a"]), overflow=0, rows=np.zeros((1, 1)))
     with pytest.raises(InputError, match="another version"):
         FlightRecord.load(path)
+
+
+def test_the_sink_gets_every_row_also_those_that_find_no_place():
+    record = FlightRecord(2)
+    seen: list[bytes] = []
+    record.sink = lambda content: seen.append(bytes(content))
+    rows = [row(t_s=float(index)) for index in range(3)]
+    for numbers in rows:
+        record.append(numbers)
+    assert (len(record), record.overflow) == (2, 1)
+    assert b"".join(seen) == np.array(rows).tobytes()
+    assert b"".join(seen[:2]) == record.rows.tobytes()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import bundled_root
+from companion.config import bundled_root, load_vehicle
 from companion.errors import InputError
 from companion.trajectory.anchored import anchored
 from companion.trajectory.feasibility import check
@@ -18,7 +18,7 @@ from companion.trajectory.shapes import Circle, Hover, Lemniscate
 # Gentle for any multirotor that flies outdoors.
 LIMITS = ReferenceLimits(5.0, 3.2, 0.5, 9.0, 80.0, 2.0)
 MODEL = PointMass(4.76, 0.2)
-BUNDLED = ["circle", "helix", "hover", "indoor", "line", "lissajous", "paper", "windtest"]
+BUNDLED = ["circle", "helix", "hover", "indoor", "line", "lissajous", "paper", "waypoints", "windtest"]
 
 
 def test_no_bundled_file_is_forgotten() -> None:
@@ -27,7 +27,7 @@ def test_no_bundled_file_is_forgotten() -> None:
 
 @pytest.mark.parametrize("name", BUNDLED)
 def test_bundled_file_can_be_flown_with_join_and_stop(name: str) -> None:
-    trajectory = load(name)
+    trajectory = load(name, vehicle=load_vehicle("bundled"))
     assert trajectory.name == name
     placed = anchored(trajectory, (0.0, 0.0, -10.0), (0.0, 0.0, 0.0))
     assert check(placed, LIMITS, MODEL) == []

@@ -53,6 +53,7 @@ def read(source: Source, frame: Frame) -> Polynomials:
         duration_s = row.values[0]
         if not duration_s > 0.0:
             raise source.fault(row.line, f"duration is {duration_s:g} s; it must be above zero")
+        within(source, row.line, duration_s, DURATION_MAX_S, "duration", "s")
         piece, turn = _piece(row, frame)
         _check(source, row, piece, turn)
         path.append(piece)

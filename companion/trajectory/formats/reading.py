@@ -30,6 +30,7 @@ SHOWN_MAX = 40
 POSITION_MAX_M = 100e3
 SPEED_MAX_M_S = 150.0
 """More than any multirotor flies: what is beyond is taken for another unit."""
+ACCELERATION_MAX_M_S2 = 1000.0
 DURATION_MAX_S = 6.0 * 3600.0
 
 

@@ -12,6 +12,7 @@ from companion.control.types import Vec3
 from companion.frames import Frame, ned_from
 from companion.trajectory.formats.contents import Sampled
 from companion.trajectory.formats.reading import (
+    ACCELERATION_MAX_M_S2,
     DURATION_MAX_S,
     POSITION_MAX_M,
     SPEED_MAX_M_S,
@@ -68,10 +69,13 @@ def sampled(
             " are a waypoint file (x,y,z)",
         )
     _check_steps(source, rows, t_s, positions)
-    for columns in (velocities,) if velocities else ():
-        for row in rows:
-            for axis, column in zip(AXES, columns, strict=True):
-                within(source, row.line, row.values[column], SPEED_MAX_M_S, f"the velocity along {axis}", "m/s")
+    for name, columns, limit, unit in (
+        ("velocity", velocities, SPEED_MAX_M_S, "m/s"),
+        ("acceleration", accelerations, ACCELERATION_MAX_M_S2, "m/s^2"),
+    ):
+        for row in rows if columns is not None else ():
+            for axis, column in zip(AXES, columns or (), strict=True):
+                within(source, row.line, row.values[column], limit, f"the {name} along {axis}", unit)
     return Sampled(
         t_s=np.array(t_s),
         p_m=vectors(rows, positions, frame),

@@ -1,0 +1,119 @@
+"""The program on the vehicle: it waits for commands and trajectories of ground tools, and flies.
+
+Two processes: one owns the vehicle link and flies, the other talks to ground tools; either is started again when it
+dies. What it takes is in docs/mavlink.md. Ctrl-C hands a flight over to Hold first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from companion.cli.common import ControllerOption, EngineOption, JsonOption, controller_changes, say
+
+EXAMPLE = "Example: companion serve --vehicle px4_sih --connect udpin:127.0.0.1:14540"
+
+CONNECTION = "udpin:127.0.0.1:14540"
+GROUND = "udpin:127.0.0.1:14590"
+
+
+def run(
+    vehicle: Annotated[str, typer.Option("--vehicle", metavar="NAME", help="Vehicle file, or a bundled one's name.")],
+    connect: Annotated[
+        str, typer.Option("--connect", help="The vehicle: udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.")
+    ] = CONNECTION,
+    ground: Annotated[
+        list[str] | None,
+        typer.Option("--ground", metavar="CONNECTION", help=f"For ground tools (repeatable); default {GROUND}."),
+    ] = None,
+    folder: Annotated[
+        Path, typer.Option("--folder", metavar="DIR", help="The trajectories that may be started.")
+    ] = Path("trajectories"),
+    flights: Annotated[Path, typer.Option("--flights", metavar="DIR", help="Gets a folder for every flight.")] = Path(
+        "flights"
+    ),
+    flight: Annotated[
+        str | None,
+        typer.Option(
+            "--flight", metavar="NAME", help="Flight file with output, limits, gains; its trajectory is not flown."
+        ),
+    ] = None,
+    output: Annotated[str | None, typer.Option("--output", help='"rates", "attitude" or "actuators".')] = None,
+    controller: ControllerOption = None,
+    engine: EngineOption = "auto",
+    as_json: JsonOption = False,
+) -> None:
+    """Waits for commands and flies, until it is stopped."""
+    from companion.accelerate import resolve
+    from companion.ground.settings import Settings
+    from companion.ground.supervisor import Supervisor
+    from companion.link.transport import parse_connection
+
+    resolve(engine)
+    links = tuple(ground or [GROUND])
+    for connection in (connect, *links):
+        parse_connection(connection)
+    settings = Settings(
+        connection=connect,
+        ground=links,
+        trajectories=str(_usable(folder, "--folder")),
+        flights=str(_usable(flights, "--flights")),
+        engine=engine,
+        flight=_flight(vehicle, flight, controller_changes(controller, output)),
+    )
+
+    def ready(control_pid: int, ground_pid: int) -> None:
+        facts = {"connect": connect, "ground": list(links), "control_pid": control_pid, "ground_pid": ground_pid}
+        if as_json:
+            print(json.dumps({"ready": True, **facts}), flush=True)
+        say(f"ready: vehicle link {connect}, ground links {', '.join(links)}", quiet=as_json)
+
+    supervisor = Supervisor(settings, lambda line: say(f"  {line}", quiet=as_json), ready)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda number, _: supervisor.stop(number))
+    raise typer.Exit(supervisor.run())
+
+
+def _usable(folder: Path, option: str) -> Path:
+    """The folder, there and writable.
+
+    Raises:
+        InputError: it is not.
+    """
+    from companion.errors import InputError
+
+    folder = folder.expanduser().absolute()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{option} {folder}: cannot be made ({error.strerror})") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{option} {folder}: may not be written to")
+    return folder
+
+
+def _flight(vehicle: str, flight: str | None, changes: dict[str, Any]) -> dict[str, Any]:
+    """What every flight has in common, checked: the gates of the gains are passed before anything connects.
+
+    Raises:
+        InputError, RefusedError: a file is wrong, or the gains do not pass.
+    """
+    from companion.cli.common import adjustments, vehicle_changes
+    from companion.config import build_flight, load_flight
+    from companion.flight.preflight import gate_gains
+
+    hover = {"name": "hover", "shape": "hover", "duration_s": 1.0, "hover": {"point_m": [0.0, 0.0, 0.0]}}
+    adjust = adjustments(**changes)
+    if flight is None:
+        built = build_flight({"name": "serve", "vehicle": vehicle, "trajectory": hover}, "command line", adjust)
+    else:
+        built = load_flight(flight, adjustments(**changes, **vehicle_changes(vehicle), trajectory=hover))
+    if built.output.controller == "law":
+        gate_gains(built.vehicle)
+    common = {"vehicle", "output", "acceptance", "takeoff_altitude_m", "after"}
+    return built.model_dump(mode="json", include=common, exclude_none=True)

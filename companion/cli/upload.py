@@ -1,0 +1,82 @@
+"""The vehicle checks the file itself before it takes it, and says why not when it does not (exit code 3); what it had
+under that name stays then. An upload that was cut off goes on where it ended when it is made again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from companion.cli.common import JsonOption, say
+
+if TYPE_CHECKING:
+    from companion.ground.upload import Verdict
+
+EXAMPLE = "Example: companion upload lap.csv --to udpout:192.168.1.10:14590"
+
+ToOption = Annotated[
+    str,
+    typer.Option("--to", metavar="CONNECTION", help="The vehicle: udpout:HOST:PORT, udpin:HOST:PORT, serial:DEV:BAUD."),
+]
+SystemOption = Annotated[
+    int | None,
+    typer.Option("--system", metavar="ID", min=1, max=255, help="The vehicle's system id; needed if several answer."),
+]
+DEFAULT_TO = "udpout:127.0.0.1:14590"
+
+
+def run(
+    file: Annotated[str, typer.Argument(help="Trajectory file of any known format, or the name of a bundled one.")],
+    to: ToOption = DEFAULT_TO,
+    name: Annotated[
+        str | None,
+        typer.Option("--name", metavar="NAME", help="What to call it there; default: its own name."),
+    ] = None,
+    system: SystemOption = None,
+    timeout: Annotated[
+        float, typer.Option("--timeout", metavar="S", min=1.0, help="How long the vehicle's check may take.")
+    ] = 90.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Uploads the file and prints the vehicle's verdict."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+
+    from companion.config import find
+    from companion.errors import ExitCode
+    from companion.ground.upload import Files
+
+    path = find(file, "trajectories")
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    with (
+        Files(to, system=system) as files,
+        Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar,
+    ):
+        task = bar.add_task("uploading", total=None)
+
+        def show(there: int, total: int) -> None:
+            if there == total:
+                bar.update(task, description="the vehicle checks it", completed=there, total=total)
+            else:
+                bar.update(task, completed=there, total=total)
+
+        verdict = files.upload(Path(path), name, progress=show, verdict_patience_s=timeout)
+    if as_json:
+        print(json.dumps(verdict._asdict(), indent=2))
+    else:
+        _say(verdict)
+    raise typer.Exit(int(ExitCode.DONE if verdict.accepted else ExitCode.REFUSED))
+
+
+def _say(verdict: Verdict) -> None:
+    if verdict.resumed_from:
+        say(f"{verdict.name}: went on at byte {verdict.resumed_from} of {verdict.size_bytes}")
+    if verdict.accepted:
+        say(f"{verdict.name}: stored with number {verdict.id} ({verdict.size_bytes} bytes, CRC-32 {verdict.crc32:08x})")
+        say(f"  {verdict.verdict}")
+    else:
+        say(f"{verdict.name}: REFUSED by the vehicle: {verdict.verdict}")

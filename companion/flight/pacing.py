@@ -1,0 +1,56 @@
+"""An operator's wish for another pace, planned beside the control steps and then flown."""
+
+from __future__ import annotations
+
+import math
+
+from companion.flight.course import Course
+from companion.flight.tempo import LEAD_S, PLANNING_S, RampPlan
+
+LOOK_AHEAD_S = 0.2
+"""The control step asks for the reference this far ahead at most; what is nearer must not change any more."""
+
+
+class Pacing:
+    """Brings a course to the pace that is wanted: 1, its own, or 0, rest.
+
+    Args:
+        course: what is flown.
+        state_rate_hz: how often `tick` is called.
+    """
+
+    def __init__(self, course: Course, state_rate_hz: float) -> None:
+        self._course = course
+        self._wanted = 1.0
+        self._plan: RampPlan | None = None
+        plan = course.plan_pace(0.0, 1.0)
+        self._samples = math.ceil(plan.samples_max / (PLANNING_S * state_rate_hz))
+
+    def want(self, rate: float, t_s: float) -> None:
+        """Wants a pace from now on; wanting what is wanted already changes nothing.
+
+        Args:
+            rate: 0 or 1.
+            t_s: time since engaging [s].
+        """
+        if rate != self._wanted:
+            self._wanted = rate
+            self._plan = self._course.plan_pace(t_s + LEAD_S, rate)
+
+    def tick(self, t_s: float) -> None:
+        """Plans on; called once per state, when its setpoint is out."""
+        if self._plan is None:
+            return
+        if t_s > self._plan.begin_s - LOOK_AHEAD_S:  # too late for this one: states came too rarely
+            self._plan = self._course.plan_pace(t_s + LEAD_S, self._wanted)
+        ramp = self._plan.work(self._samples)
+        if ramp is not None:
+            self._plan = None
+            self._course.change_pace(ramp)
+
+    def reached(self, t_s: float) -> bool:
+        """Whether the course has the pace that is wanted."""
+        if self._plan is not None:
+            return False
+        ramps = self._course.ramps
+        return not ramps or t_s >= ramps[-1].begin_s + ramps[-1].duration_s

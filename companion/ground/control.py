@@ -1,0 +1,468 @@
+"""The control process of `companion serve`: owns the vehicle link, flies when asked to, and waits otherwise.
+
+While it waits it sends heartbeats, answers the vehicle's clock and never a setpoint: whatever mode it finds the vehicle
+in after a restart, it leaves it there. A flight is the loop of `companion.flight`, with this process as its host: what
+the ground process asks is looked at once per control turn, and takes microseconds when there is nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import socket
+import sys
+import time
+import traceback
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from companion.config import build_flight
+from companion.errors import CompanionError, ExitCode, LinkError
+from companion.flight.connect import AUTOPILOT_COMPONENT, autopilot_system, send_heartbeat
+from companion.flight.loop import FlightLoop, Progress
+from companion.flight.phases import Autopilot, Cause, FlightEnded, Order, Phase
+from companion.flight.process import Status, warm_up
+from companion.flight.reports import take_heartbeat, take_report
+from companion.flight.tracker import kernels
+from companion.ground.channel import Channel, Copy, Outgoing
+from companion.ground.filter import Gate
+from companion.ground.messages import targets_of
+from companion.ground.preparation import Closing, Preparation
+from companion.ground.report import Report
+from companion.ground.settings import Settings
+from companion.ground.standing import IDLE, PREPARING, Standing
+from companion.ground.undertakings import Undertakings
+from companion.link import codec, modes, timesync
+from companion.link.framing import Frame
+from companion.link.operations import Operation, Operations
+from companion.link.wire import COMPANION_COMPONENT, Wire
+from companion.record.recorder import Recorder
+
+IDLE_WAIT_S: Final = 0.02
+STANDING_INTERVAL_NS: Final = 200_000_000
+HEARTBEAT_INTERVAL_S: Final = 1.0
+UNHEARD_S: Final = 3.0
+"""Without a heartbeat of the autopilot for this long, there is none."""
+PEER_PATIENCE_S: Final = 5.0
+"""A peer that is no autopilot, or is silent, is given up after this time; not in flight."""
+ITEMS_PER_TURN: Final = 4
+"""Of the ground process, so that it cannot keep a control turn."""
+CONNECT_TIMEOUT_S: Final = 15.0
+
+COPIED: Final = frozenset({0, 1, 22, 24, 44, 47, 51, 73, 77, 110, 147, 148, 242, 245, 253, 345})
+"""Of the autopilot's messages the ground process gets these: HEARTBEAT, SYS_STATUS, PARAM_VALUE, GPS_RAW_INT, the
+mission protocol's answers, COMMAND_ACK, FTP, BATTERY_STATUS, AUTOPILOT_VERSION, HOME_POSITION, EXTENDED_SYS_STATE,
+STATUSTEXT, PARAM_ERROR."""
+
+_NOT_YET_FLYING: Final = {Phase.CONNECT, Phase.PREFLIGHT}
+_ORDERS: Final = {order.value: order for order in Order}
+
+
+class Control:
+    """The program; implements `flight.host.Host`.
+
+    Args:
+        settings: of `companion serve`.
+        channel: to the ground process.
+        report: to the supervisor.
+    """
+
+    def __init__(self, settings: Settings, channel: Channel, report: Report) -> None:
+        self._settings = settings
+        self._channel = channel
+        self._report = report
+        self._gate = Gate()
+        self._undertakings = Undertakings(self._on_end)
+        self._lines: deque[str] = deque()
+        self._recorder: Recorder | None = None
+        self._autopilot = Autopilot()
+        self._system: int | None = None
+        self._heard_s = -math.inf
+        self._peer_since_s = time.monotonic()
+        self._spoken_s = -math.inf
+        self._ops: Operations | None = None
+        self._landing: tuple[int, Operation] | None = None
+        self._preparation: Preparation | None = None
+        self._closing: Closing | None = None
+        self._loop: FlightLoop | None = None
+        self._standing = Standing()
+        self._standing_ns = 0
+        self._stopping = False
+        self._abandoned = False
+        """Whether the flight that is being prepared is not wanted any more."""
+
+    # -- the program ----------------------------------------------------------------------------------------------
+
+    def run(self) -> int:
+        """Until told to stop.
+
+        Raises:
+            InputError, LinkError: the vehicle link cannot be had, or is gone.
+        """
+        self._warm_up()
+        with Wire.open(self._settings.connection, tap=self._tap) as wire:
+            self._wire = wire
+            self._report.send(ready=True)
+            while not self._stopping:
+                self._idle_turn()
+                preparation = self._preparation
+                if preparation is not None and preparation.over and self._closed():
+                    self._preparation = None
+                    self._fly(preparation)
+        if self._closing is not None:
+            self._closing.wait()
+        self._flush_lines()
+        return int(ExitCode.DONE)
+
+    def stop(self) -> None:
+        """Ends the program, after handing a flight over; safe to call from a signal handler."""
+        self._stopping = True
+        if self._loop is not None:
+            self._loop.interrupt()
+
+    def _warm_up(self) -> None:
+        """Compiles or loads the kernels before anything connects."""
+        hover = {"name": "hover", "shape": "hover", "duration_s": 1.0, "hover": {"point_m": [0.0, 0.0, 0.0]}}
+        flight = build_flight({**self._settings.flight, "name": "hover", "trajectory": hover}, "companion serve")
+        warm_up(flight, kernels(self._settings.engine))
+        codec.message_formats()
+
+    def _tap(self, direction: int, raw: bytes, wall_ns: int) -> None:
+        recorder = self._recorder
+        if recorder is not None:
+            recorder.offer(direction, raw, wall_ns)
+
+    # -- waiting --------------------------------------------------------------------------------------------------
+
+    def _idle_turn(self) -> None:
+        for frame in self._wire.receive(IDLE_WAIT_S):
+            self._on_idle_frame(frame)
+        now_s = time.monotonic()
+        if now_s - self._spoken_s >= HEARTBEAT_INTERVAL_S:
+            self._spoken_s = now_s
+            if self._wire.peer is not None or self._system is not None:
+                send_heartbeat(self._wire)
+            self._stopping = self._stopping or self._report.closed
+        self._watch_peer(now_s)
+        if self._ops is not None:
+            self._ops.update(now_s)
+            self._follow_landing()
+        self.turn()
+
+    def _closed(self) -> bool:
+        """Whether the results of the flight before are away: no thread may run beside a flight."""
+        if self._closing is not None and self._closing.over:
+            self._closing = None
+        return self._closing is None
+
+    def _watch_peer(self, now_s: float) -> None:
+        """The first sender at the port is not always the vehicle, and a restarted one may come from another port."""
+        if now_s - max(self._heard_s, self._peer_since_s) < PEER_PATIENCE_S:
+            return
+        self._peer_since_s = now_s
+        if self._wire.last_foreign is not None:
+            self._wire.peer, self._wire.last_foreign = self._wire.last_foreign, None
+        else:
+            self._wire.release_peer()
+
+    def _on_idle_frame(self, frame: Frame) -> None:
+        if frame.msgid == codec.HEARTBEAT and frame.compid == AUTOPILOT_COMPONENT:
+            try:
+                system = autopilot_system(frame)
+            except FlightEnded as unusable:
+                if self._system is None:
+                    self._say(unusable.detail)
+                return
+            if system is not None and system != self._system:
+                self._meet(system, frame)
+        if frame.sysid != self._system or frame.compid != AUTOPILOT_COMPONENT:
+            self.on_frame(frame)
+            return
+        if frame.msgid == codec.TIMESYNC:
+            self._answer_time(frame)
+        elif frame.msgid == codec.HEARTBEAT:
+            self._heard_s = time.monotonic()
+            take_heartbeat(self._autopilot, frame)
+            self.on_frame(frame)
+        elif frame.msgid != codec.ODOMETRY:
+            if self._ops is None or not self._ops.on_frame(frame, time.monotonic()):
+                take_report(self._autopilot, frame)
+            self.on_frame(frame)
+
+    def _meet(self, system: int, frame: Frame) -> None:
+        """An autopilot, or another one than before."""
+        self._system = self._wire.system_id = system
+        self._autopilot = Autopilot()
+        self._ops = Operations(self._wire.send, system)
+        self._spoken_s = -math.inf
+        take_heartbeat(self._autopilot, frame)
+        mode = self._autopilot.mode
+        self._say(f"heard the autopilot: system {system}, mode {'unknown' if mode is None else mode.label}")
+        if mode == modes.OFFBOARD:
+            self._say("the vehicle is in Offboard and nothing here flies it: the autopilot's own failsafe acts")
+
+    def _answer_time(self, frame: Frame) -> None:
+        message = codec.decode_timesync(frame.payload)
+        if timesync.is_request(message, self._wire.system_id, self._wire.component_id):
+            answer = timesync.answer(message, time.monotonic_ns(), frame.sysid, frame.compid)
+            self._wire.send(codec.TIMESYNC, answer)
+
+    # -- flying ---------------------------------------------------------------------------------------------------
+
+    def _fly(self, preparation: Preparation) -> None:
+        """Flies what is ready; returns when the vehicle is handed over or down."""
+        ready, status = preparation.ready, _FlightStatus(self)
+        if self._abandoned or self._stopping:
+            self._abandoned = False
+            if ready is not None:
+                ready.close(status, None)
+            self._standing = replace(self._standing, phase=IDLE, ended="stopped before it began")
+            return
+        if ready is None:
+            self._say(f"refused: {preparation.refusal}", warning=True)
+            self._standing = replace(self._standing, phase=IDLE, ended=f"refused: {preparation.refusal}")
+            self._undertakings.fail(preparation.refusal)
+            return
+        self._recorder = ready.recorder
+        self._loop = loop = ready.loop(
+            self._wire,
+            status,
+            connection=self._settings.connection,
+            timeout_s=CONNECT_TIMEOUT_S,
+            system=self._system,
+            host=self,
+        )
+        outcome = loop.run()
+        ready.note_outcome(outcome)
+        self._recorder = None
+        self._loop = None
+        self._autopilot = replace(loop.autopilot)
+        self._heard_s = time.monotonic()
+        well = outcome.cause in {Cause.COMPLETED, Cause.STOPPED}
+        self._standing = replace(self._standing, phase=IDLE, paused=False, ended=outcome.sentence)
+        self._flush_lines()
+        self._undertakings.check()
+        self._undertakings.fail(outcome.sentence)
+        self._say(outcome.sentence, warning=not well)
+        self._report.send(flight=str(ready.folder), outcome=outcome.sentence)
+        self._closing = Closing(ready, outcome, status)
+
+    def on_progress(self, progress: Progress) -> None:
+        """How far the flight is."""
+        north, east, down = progress.disturbance_m_s2
+        by_law = math.isfinite(progress.lyapunov)
+        self._standing = replace(
+            self._standing,
+            track_s=progress.t_s,
+            duration_s=progress.duration_s,
+            to_go_s=progress.to_go_s,
+            error_m=progress.error_m,
+            lyapunov=progress.lyapunov if by_law else None,
+            disturbance_m_s2=(north, east, down) if by_law and math.isfinite(north) else None,
+            steps=progress.steps,
+        )
+
+    # -- the host of a flight -------------------------------------------------------------------------------------
+
+    def on_frame(self, frame: Frame) -> None:
+        """Copies for the ground process what it can use: the autopilot's slow messages, and what is addressed to us."""
+        if frame.sysid == self._system and frame.compid == AUTOPILOT_COMPONENT:
+            if frame.msgid == codec.HEARTBEAT:
+                self._heard_s = frame.arrival_wall_ns * 1e-9
+            if frame.msgid not in COPIED:
+                return
+        else:
+            targets = targets_of(frame.msgid, frame.payload)
+            if targets is None or targets.component != COMPANION_COMPONENT:
+                return
+        self._channel.copy(frame.raw)
+
+    def turn(self) -> None:
+        """What the ground process wants, and how things stand for it. Never raises."""
+        try:
+            for item in self._channel.receive(ITEMS_PER_TURN):
+                if isinstance(item, Outgoing):
+                    self._send_for_ground(item)
+                elif not isinstance(item, Copy):
+                    self._on_note(item)
+            self._undertakings.check()
+            self._flush_lines()
+            wall_ns = time.monotonic_ns()
+            if wall_ns - self._standing_ns > STANDING_INTERVAL_NS:
+                self._standing_ns = wall_ns
+                self._tell_standing()
+        except Exception:  # whatever is wrong between the processes must not end a flight
+            with contextlib.suppress(Exception):
+                self._report.line("a fault of the program: " + traceback.format_exc(limit=3))
+
+    def _send_for_ground(self, item: Outgoing) -> None:
+        if self._gate.passes(item.msgid, item.payload, self._system, time.monotonic()):
+            self._wire.send(item.msgid, item.payload)
+
+    def _tell_standing(self) -> None:
+        loop = self._loop
+        autopilot = self._autopilot if loop is None else loop.autopilot
+        mode = autopilot.mode
+        phase = self._standing.phase
+        if loop is not None:
+            phase = loop.phase.value
+        elif phase not in {IDLE, PREPARING}:
+            phase = IDLE
+        self._standing = replace(
+            self._standing,
+            system=self._system,
+            heard=time.monotonic() - self._heard_s < UNHEARD_S,
+            mode=None if mode is None else mode.label,
+            custom_mode=0 if mode is None else mode.custom_mode,
+            armed=autopilot.armed,
+            phase=phase,
+            paused=loop is not None and loop.paused,
+        )
+        self._channel.note(standing=self._standing.as_note())
+
+    # -- requests -------------------------------------------------------------------------------------------------
+
+    def _on_note(self, note: dict[str, Any]) -> None:
+        number, what = note.get("request"), note.get("what")
+        if not isinstance(number, int) or not isinstance(what, str):
+            return
+        if what == "start":
+            refusal = self._start(number, note)
+        elif what in _ORDERS:
+            refusal = self._order(number, _ORDERS[what])
+        else:
+            refusal = f"{what}: this version does not know how"
+        self._channel.note(taken=number, refusal=refusal)
+
+    def _start(self, number: int, note: dict[str, Any]) -> str:
+        name, path, identity = note.get("name"), note.get("path"), note.get("id")
+        if not (isinstance(name, str) and isinstance(path, str) and isinstance(identity, int)):
+            return "start: incomplete request"
+        if self._loop is not None or self._preparation is not None:
+            return f"start: {self._standing.trajectory} is under way; stop it first"
+        if time.monotonic() - self._heard_s > UNHEARD_S:
+            return f"start: no autopilot is heard at {self._settings.connection}"
+        before = self._standing
+        self._standing = Standing(
+            system=before.system,
+            heard=before.heard,
+            mode=before.mode,
+            custom_mode=before.custom_mode,
+            armed=before.armed,
+            phase=PREPARING,
+            trajectory=name,
+            trajectory_id=identity,
+        )
+        self._undertakings.add(number, "start", self._begun)
+        self._say(f"start {name}: checking")
+        self._preparation = Preparation(self._settings, name, Path(path), self._lines.append)
+        return ""
+
+    def _begun(self) -> bool:
+        return self._loop is not None and self._loop.phase not in _NOT_YET_FLYING
+
+    def _order(self, number: int, order: Order) -> str:
+        loop = self._loop
+        if loop is None:
+            return self._order_idle(number, order)
+        refusal = loop.order(order)
+        if not refusal:
+            self._undertakings.replace(order.value)
+            self._undertakings.add(number, order.value, lambda: self._followed(loop, order))
+        return refusal and f"{order.value}: {refusal}"
+
+    def _followed(self, loop: FlightLoop, order: Order) -> bool:
+        """Whether the flight is where an order wanted it."""
+        over = self._loop is not loop
+        if order is Order.PAUSE:
+            return loop.paused and not over
+        if order is Order.RESUME:
+            return loop.phase in {Phase.JOIN, Phase.TRACK, Phase.HOLD} and not over
+        if order is Order.LAND:
+            return over or (loop.phase is Phase.LAND and loop.autopilot.mode == modes.LAND)
+        return over
+
+    def _order_idle(self, number: int, order: Order) -> str:
+        """Without a flight there is nothing to pause; landing is asked of the autopilot."""
+        if self._preparation is not None:
+            if order is not Order.STOP:
+                return f"{order.value}: the flight is being prepared; stop it, or try again in a moment"
+            self._abandoned = True
+            self._undertakings.fail("stopped by the operator")
+            self._undertakings.add(number, order.value, lambda: self._preparation is None)
+            return ""
+        if order is not Order.LAND or self._ops is None:
+            return f"{order.value}: nothing is being flown"
+        if self._landing is not None:
+            return "land: a landing is being asked for already"
+        self._landing = number, self._ops.land(time.monotonic())
+        return ""
+
+    def _follow_landing(self) -> None:
+        if self._landing is None or self._landing[1].pending:
+            return
+        number, operation = self._landing
+        self._landing = None
+        self._on_end(number, operation.accepted, "" if operation.accepted else operation.sentence)
+
+    def _on_end(self, number: int, done: bool, sentence: str) -> None:
+        self._channel.note(done=number, well=done, sentence=sentence)
+
+    # -- telling people -------------------------------------------------------------------------------------------
+
+    def say_line(self, line: str) -> None:
+        """A line of the flight for people."""
+        self._say(line)
+
+    def _say(self, line: str, *, warning: bool = False) -> None:
+        self._channel.note(line=line, warning=warning)
+        self._report.line(line)
+
+    def _flush_lines(self) -> None:
+        while self._lines:
+            self._say(self._lines.popleft())
+
+
+class _FlightStatus(Status):
+    """What a flight says goes to the ground process and the supervisor; lines of other threads wait for their turn."""
+
+    def __init__(self, control: Control) -> None:
+        self._control = control
+
+    def send(self, **content: Any) -> None:
+        """The outcome is told by the control process itself."""
+
+    def line(self, text: str) -> None:
+        """A line for people."""
+        self._control._lines.append(text)
+
+    def progress(self, progress: Progress) -> None:
+        """How far the flight is."""
+        self._control.on_progress(progress)
+
+
+def main() -> int:
+    """Arguments: settings (JSON), file descriptors of the channel and of the supervisor's."""
+    settings, channel_fd, report_fd = sys.argv[1:]
+    report = Report(socket.socket(fileno=int(report_fd)))
+    channel = Channel(socket.socket(fileno=int(channel_fd)))
+    channel.discard()
+    control = Control(Settings.from_json(settings), channel, report)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: control.stop())
+    try:
+        return control.run()
+    except CompanionError as error:
+        report.send(error=str(error))
+        return int(error.exit_code) if not isinstance(error, LinkError) else int(ExitCode.LOST)
+    except Exception as error:
+        traceback.print_exc()
+        report.send(error=f"a fault of the program: {type(error).__name__}: {error}")
+        return int(ExitCode.INTERNAL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""The services that the ground process hosts, built from the settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+from zlib import crc32
+
+from companion import __version__
+from companion.config import build_flight
+from companion.errors import InputError
+from companion.ground.examine import Apart
+from companion.ground.files import FileServer
+from companion.ground.settings import Settings
+from companion.ground.store import TrajectoryStore
+
+VERDICT: Final = "may be flown"
+
+
+def judge(flight: dict[str, Any], path: Path) -> str:
+    """The vehicle's own check of a trajectory file: what a start would refuse, as far as it can be known before.
+
+    Args:
+        flight: contents of a flight file but for name and trajectory.
+        path: of the trajectory's file.
+
+    Returns:
+        The verdict in words.
+
+    Raises:
+        CompanionError: what is wrong.
+    """
+    from companion.flight.preflight import gate_reference
+    from companion.trajectory.load import load
+
+    vehicle = build_flight({**flight, "name": "check", "trajectory": str(path)}, "companion serve").vehicle
+    trajectory = load(path, vehicle=vehicle, confined=True)
+    gate_reference(trajectory, vehicle)
+    return f"{VERDICT}: {trajectory.duration_s:.1f} s"
+
+
+def open_store(settings: Settings) -> TrajectoryStore:
+    """The trajectories that may be started.
+
+    Raises:
+        InputError: the folder cannot be used.
+    """
+    folder = Path(settings.trajectories)
+    depends = crc32(json.dumps(settings.flight, sort_keys=True).encode())
+    try:
+        return TrajectoryStore(
+            folder, Apart(partial(judge, settings.flight)), checked_by=f"{__version__}-{depends:08x}"
+        )
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be used for trajectories ({error.strerror}); see --folder") from None
+
+
+def file_server(store: TrajectoryStore, say: Callable[[str, bool], None]) -> FileServer:
+    """The service for uploads."""
+    return FileServer(store, say)
+
+
+class Startable:
+    """Implements `commands.Trajectories` over the store."""
+
+    def __init__(self, store: TrajectoryStore) -> None:
+        self._store = store
+
+    def find(self, identity: int) -> tuple[str, str]:
+        """Name and path of a trajectory that the vehicle's check has accepted. Raises LookupError."""
+        entry = self._store.numbered(identity)
+        if entry is None:
+            raise LookupError(f"no trajectory has the id {identity}")
+        if not entry.accepted:
+            raise LookupError(f"{entry.name}: {entry.verdict}")
+        return entry.name, str(self._store.path(entry.name).absolute())

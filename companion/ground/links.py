@@ -1,0 +1,146 @@
+"""The ground links: ports and lines at which ground tools find the companion.
+
+A `udpin` port talks to everybody who sent a valid frame to it lately; `udpout` and `serial` have one peer each. Every
+peer is a `GroundLink` of its own, so that an answer goes where the question came from.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from companion.errors import LinkError
+from companion.ground.messages import COMPANION_COMPONENT
+from companion.link.codec import message_formats
+from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame
+from companion.link.transport import Address, Transport, open_transport
+
+PEERS_MAX: Final = 16
+"""Ground tools at one port; when a further one comes, the one that was silent for longest is forgotten."""
+PEER_SILENCE_S: Final = 30.0
+"""After which a tool at a `udpin` port gets no more reports."""
+_READS_MAX: Final = 64
+
+
+class Peer:
+    """The way to one ground tool; implements `service.GroundLink`."""
+
+    def __init__(self, port: GroundPort, address: Address | None) -> None:
+        self.heard_s = time.monotonic()
+        """When it last sent something."""
+        self._port = port
+        self._address = address
+
+    @property
+    def name(self) -> str:
+        """The connection, and the tool's address where there may be several."""
+        return self._port.connection if self._address is None else f"{self._port.connection} {_shown(self._address)}"
+
+    def send(self, msgid: int, payload: bytes) -> None:
+        """Sends one message to this tool alone."""
+        self._port.send_to(msgid, payload, self._address)
+
+
+class GroundPort:
+    """One socket or line.
+
+    Args:
+        connection: `udpin:127.0.0.1:14590`, `udpout:host:port` or `serial:/dev/ttyUSB0:57600`.
+        system: asked for the system id that we send with.
+        guard: verifies and signs.
+
+    Raises:
+        InputError, LinkError: it cannot be opened.
+    """
+
+    def __init__(self, connection: str, system: Callable[[], int], guard: FrameGuard | None = None) -> None:
+        self.connection = connection
+        self.counters = LinkCounters()
+        self._transport: Transport = open_transport(connection)
+        self._system = system
+        self._guard = guard
+        self._formats = message_formats()
+        self._parser = FrameParser(self._formats, self.counters, guard)
+        self._leftover = b""
+        self._seq = 0
+        self._peers: dict[Address | None, Peer] = {}
+        if self._transport.stream or self._transport.fixed_peer is not None:
+            self._peers[self._transport.fixed_peer] = Peer(self, self._transport.fixed_peer)
+
+    def fileno(self) -> int:
+        """File descriptor to wait on."""
+        return self._transport.fileno()
+
+    @property
+    def peers(self) -> list[Peer]:
+        """Who gets reports."""
+        return list(self._peers.values())
+
+    def receive(self) -> list[tuple[Frame, Peer]]:
+        """Every good frame that is there; a bounded number of reads, so that a flood cannot keep it.
+
+        Raises:
+            LinkError: the line is gone.
+        """
+        found: list[tuple[Frame, Peer]] = []
+        for _ in range(_READS_MAX):
+            try:
+                got = self._transport.read()
+            except OSError:  # the network's report about something sent earlier
+                self.counters.unreachable += 1
+                continue
+            if got is None:
+                break
+            found += self._parsed(*got)
+        return found
+
+    def _parsed(self, data: bytes, address: Address | None) -> list[tuple[Frame, Peer]]:
+        frames: list[Frame] = []
+        stream = self._transport.stream
+        data = self._leftover + data
+        done = self._parser.parse(data, time.monotonic_ns(), frames, [], final=not stream)
+        self._leftover = data[done:] if stream else b""
+        if not frames:
+            return []
+        peer = self._peer(address if self._transport.fixed_peer is None else self._transport.fixed_peer)
+        return [(frame, peer) for frame in frames]
+
+    def _peer(self, address: Address | None) -> Peer:
+        peer = self._peers.get(address)
+        if peer is None:
+            if len(self._peers) >= PEERS_MAX:
+                oldest = min(self._peers, key=lambda known: self._peers[known].heard_s)
+                del self._peers[oldest]
+            peer = self._peers[address] = Peer(self, address)
+        peer.heard_s = time.monotonic()
+        return peer
+
+    def forget_silent(self, now_s: float) -> None:
+        """Ends the reports to tools that have gone; those with a fixed address stay."""
+        if self._transport.stream or self._transport.fixed_peer is not None:
+            return
+        for address, peer in list(self._peers.items()):
+            if now_s - peer.heard_s > PEER_SILENCE_S:
+                del self._peers[address]
+
+    def send_to(self, msgid: int, payload: bytes, address: Address | None) -> None:
+        """Sends one message to one peer."""
+        crc_extra = self._formats[msgid].crc_extra
+        raw = build_frame(msgid, payload, self._seq, self._system(), COMPANION_COMPONENT, crc_extra, self._guard)
+        self._seq = (self._seq + 1) & 0xFF
+        try:
+            sent = self._transport.write(raw, address)
+        except (OSError, LinkError):
+            self.counters.unreachable += 1
+            return
+        self.counters.sent += sent
+        self.counters.send_dropped += not sent
+
+    def close(self) -> None:
+        """Closes the socket or line."""
+        self._transport.close()
+
+
+def _shown(address: Address) -> str:
+    return f"{address[0]}:{address[1]}"

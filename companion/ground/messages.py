@@ -1,0 +1,178 @@
+"""The few messages of the ground side as bytes: commands in, acknowledgements, texts and values out."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+from companion.link import codec
+
+COMMAND_INT: Final = 75
+DEBUG_VECT: Final = 250
+NAMED_VALUE_FLOAT: Final = 251
+
+COMPANION_COMPONENT: Final = 191
+TEXT_BYTES: Final = 50
+
+_COMMAND_LONG = struct.Struct("<7fHBBB")
+_COMMAND_INT = struct.Struct("<4fiifHBBBBB")
+_COMMAND_ACK = struct.Struct("<HBBiBB")
+_STATUSTEXT = struct.Struct("<B50sHB")
+_NAMED_VALUE_FLOAT = struct.Struct("<If10s")
+_DEBUG_VECT = struct.Struct("<Qfff10s")
+_UNKNOWN_PROGRESS = 255
+
+
+class AckResult(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+    IN_PROGRESS = 5
+    CANCELLED = 6
+
+
+class Severity(IntEnum):
+    """MAV_SEVERITY, the ones used here."""
+
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+
+
+class CommandMessage(NamedTuple):
+    """COMMAND_LONG or COMMAND_INT."""
+
+    command: int
+    """MAV_CMD."""
+    params: tuple[float, ...]
+    """Seven of them; of COMMAND_INT x and y are integers."""
+    target_system: int
+    target_component: int
+    confirmation: int
+    """Above 0: repeated by the sender. COMMAND_INT has none."""
+
+
+class Targets(NamedTuple):
+    """Whom a message is for; 0 is everybody."""
+
+    system: int
+    component: int
+
+
+def decode_command(msgid: int, payload: bytes) -> CommandMessage | None:
+    """A command's payload; None for other messages."""
+    if msgid == codec.COMMAND_LONG:
+        *params, command, system, component, confirmation = _COMMAND_LONG.unpack_from(
+            payload.ljust(_COMMAND_LONG.size, b"\0")
+        )
+        return CommandMessage(command, tuple(params), system, component, confirmation)
+    if msgid == COMMAND_INT:
+        numbers = _COMMAND_INT.unpack_from(payload.ljust(_COMMAND_INT.size, b"\0"))
+        return CommandMessage(numbers[7], numbers[:7], numbers[8], numbers[9], 0)
+    return None
+
+
+def encode_ack(
+    command: int, result: AckResult, target_system: int, target_component: int, progress: int = _UNKNOWN_PROGRESS
+) -> bytes:
+    """COMMAND_ACK; the progress [%] counts while the result is IN_PROGRESS."""
+    shown = progress if result is AckResult.IN_PROGRESS else 0
+    return _COMMAND_ACK.pack(command, result, shown, 0, target_system, target_component)
+
+
+def encode_texts(severity: int, text: str, identity: int) -> Iterator[bytes]:
+    """STATUSTEXT, as many as the text takes.
+
+    Args:
+        severity: MAV_SEVERITY.
+        text: for people.
+        identity: 1..65535, another one for every text; a short text goes without.
+    """
+    data = text.encode("utf-8", "replace")
+    if len(data) <= TEXT_BYTES:
+        yield _STATUSTEXT.pack(severity, data, 0, 0)
+        return
+    chunks = [data[at : at + TEXT_BYTES] for at in range(0, len(data), TEXT_BYTES)]
+    if len(chunks[-1]) == TEXT_BYTES:
+        chunks.append(b"")  # the last one must have a NUL in it
+    for number, chunk in enumerate(chunks[:256]):
+        yield _STATUSTEXT.pack(severity, chunk, identity, number)
+
+
+def encode_named_value(time_boot_ms: int, name: str, value: float) -> bytes:
+    """NAMED_VALUE_FLOAT; the name has ten characters at most."""
+    return _NAMED_VALUE_FLOAT.pack(time_boot_ms & 0xFFFFFFFF, value, name.encode("ascii"))
+
+
+def encode_debug_vect(time_usec: int, name: str, vector: tuple[float, float, float]) -> bytes:
+    """DEBUG_VECT; the name has ten characters at most."""
+    return _DEBUG_VECT.pack(time_usec, *vector, name.encode("ascii"))
+
+
+def decode_named_value(payload: bytes) -> tuple[str, float]:
+    """Name and value of NAMED_VALUE_FLOAT."""
+    _, value, name = _NAMED_VALUE_FLOAT.unpack_from(payload.ljust(_NAMED_VALUE_FLOAT.size, b"\0"))
+    return _name(name), value
+
+
+def decode_debug_vect(payload: bytes) -> tuple[str, tuple[float, float, float]]:
+    """Name and vector of DEBUG_VECT."""
+    _, x, y, z, name = _DEBUG_VECT.unpack_from(payload.ljust(_DEBUG_VECT.size, b"\0"))
+    return _name(name), (x, y, z)
+
+
+def _name(field: bytes) -> str:
+    return field.split(b"\0", 1)[0].decode("ascii", "replace")
+
+
+def encode_autopilot_version(version: tuple[int, int, int]) -> bytes:
+    """AUTOPILOT_VERSION of the companion: what it can do, and its version."""
+    library: Any = codec.dialect()
+    capabilities = (
+        library.MAV_PROTOCOL_CAPABILITY_FTP
+        | library.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+        | library.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+        | library.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    )
+    major, minor, patch = version
+    numbers = (capabilities, 0, major << 24 | minor << 16 | patch << 8, 0, 0, 0, 0, 0)
+    return struct.pack("<QQIIIIHH", *numbers).ljust(78, b"\0")
+
+
+# ---- whom a message is for -----------------------------------------------------------------------------------------
+
+_SIZES: Final = {"char": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float": 4}
+
+
+@lru_cache(maxsize=1)
+def _target_offsets() -> dict[int, tuple[int | None, int | None]]:
+    """Where target_system and target_component stand in the payload, for every message that has one of them."""
+    offsets = {}
+    for msgid, message in codec.dialect().mavlink_map.items():
+        lengths = dict(zip(message.ordered_fieldnames, message.array_lengths, strict=False))
+        kinds = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+        at, found = 0, {}
+        for name in message.ordered_fieldnames:
+            found[name] = at
+            at += _SIZES.get(kinds[name].removesuffix("_t"), 8) * max(1, lengths.get(name, 1))
+        if "target_system" in found or "target_component" in found:
+            offsets[int(msgid)] = (found.get("target_system"), found.get("target_component"))
+    return offsets
+
+
+def targets_of(msgid: int, payload: bytes) -> Targets | None:
+    """Whom a message is for; None when the message has no target."""
+    offsets = _target_offsets().get(msgid)
+    if offsets is None:
+        return None
+    system, component = (0 if at is None or at >= len(payload) else payload[at] for at in offsets)
+    return Targets(system, component)

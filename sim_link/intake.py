@@ -1,0 +1,75 @@
+"""What comes in on one socket, message by message, and how much of it is acted on before the next state.
+
+A flood of requests must not hold up the vehicle's own time. So every state has an allowance: a datagram, a message and
+an answer count one each, and what is beyond waits in the socket until the next state, or is lost there, as with any
+receiver that is asked too much.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from .codec import Frame
+from .datagram_faults import LinkFaults
+from .udp import Address, UdpEndpoint
+
+ALLOWANCE_PER_S = 5000.0
+"""Of each socket, in wall time. A companion with setpoints at 250 Hz uses about 800 of it."""
+ALLOWANCE_LEAST = 8
+"""Per state, however fast they follow one another."""
+
+
+def allowance(state_period_s: float, sharers: int = 1) -> int:
+    """Give the allowance of one state; state_period_s: wall time between two, sharers: vehicles on the same core."""
+    return max(ALLOWANCE_LEAST, round(ALLOWANCE_PER_S * state_period_s / sharers))
+
+
+class Intake:
+    """The messages of one socket."""
+
+    def __init__(self, endpoint: UdpEndpoint, per_state: int) -> None:
+        self._endpoint = endpoint
+        self.per_state = per_state
+        """The allowance that `refill` gives."""
+        self.left = per_state
+        """What is left of it; whoever acts on a message takes its answers off."""
+        self._pending: deque[Frame] = deque()
+        """Of a datagram that was begun."""
+        self._sender: Address = ("", 0)
+
+    @property
+    def used_up(self) -> bool:
+        """Whether nothing more is acted on before the next state."""
+        return self.left <= 0
+
+    def refill(self) -> None:
+        """Begin a new state."""
+        self.left = self.per_state
+
+    def next(self, faults: LinkFaults | None) -> tuple[Frame, Address] | None:
+        """Give the next message and its sender; None when nothing is there, or the allowance is used up. Never blocks.
+
+        `faults`: what happens to datagrams on their way in.
+        """
+        pending = self._pending
+        while not pending:
+            if self.left <= 0:
+                return None
+            datagram = self._endpoint.receive()
+            if datagram is None:
+                return None
+            self.left -= 1
+            found, self._sender = datagram
+            pending.extend(found if faults is None else faults.incoming(found))
+        if self.left <= 0:
+            return None
+        self.left -= 1
+        return pending.popleft(), self._sender
+
+    def take_pending(self) -> tuple[list[Frame], Address] | None:
+        """Give what is left of the datagram that was begun; None: nothing."""
+        if not self._pending:
+            return None
+        found = list(self._pending)
+        self._pending.clear()
+        return found, self._sender
