@@ -268,14 +268,14 @@ def bundled_root() -> Path:
     return installed if installed.is_dir() else Path(__file__).parent.parent / "config"
 
 
-def _with_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+def with_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The contents of a trajectory or flight file, with the paths of trajectory files in them made absolute."""
     out = dict(data)
     if isinstance(out.get("file"), str):
         out["file"] = str(folder.absolute() / out["file"])
     named = out.get("trajectory")
     if isinstance(named, dict):
-        out["trajectory"] = _with_paths(named, folder)
+        out["trajectory"] = with_paths(named, folder)
     elif isinstance(named, str) and "\0" not in named and not Path(named).is_file() and (folder / named).is_file():
         out["trajectory"] = str(folder.absolute() / named)
     return out
@@ -315,7 +315,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         with path.open("rb") as file:
-            return _with_paths(tomllib.load(file), path.parent)
+            return with_paths(tomllib.load(file), path.parent)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file (UTF-8 expected): byte {error.start}") from None
     except ValueError as error:  # the decoder's own, and numbers with thousands of digits

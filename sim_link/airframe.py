@@ -56,9 +56,10 @@ class Airframe:
         seed: int,
         engine: str = "auto",
         start: tuple[Vec3, float] | None = None,
+        place_m: tuple[float, float] = (0.0, 0.0),
         px4: str = "1.18",
     ) -> None:
-        """Put the vehicle on the ground at the local origin, or in the air.
+        """Put the vehicle on the ground, or in the air.
 
         Args:
             vehicle: what it is.
@@ -67,6 +68,7 @@ class Airframe:
             engine: "python", "numba" or "auto" (see `accelerate.choose`).
             start: position NED [m] and yaw [rad] at which to hover, level, the rotors carrying the vertical load;
                 None = on the ground, rotors off.
+            place_m: where on the ground, north and east [m].
             px4: "1.18" or "1.13", the version whose loops are simulated.
         """
         self.vehicle = vehicle
@@ -88,7 +90,7 @@ class Airframe:
             engine,
             Setup(
                 vehicle,
-                self._start(start),
+                self._start(start, place_m),
                 self._body,
                 make_gains(vehicle, px4),
                 world.ground_d_m,
@@ -114,9 +116,9 @@ class Airframe:
         )
         """What goes wrong with the estimate."""
 
-    def _start(self, start: tuple[Vec3, float] | None) -> RigidState:
+    def _start(self, start: tuple[Vec3, float] | None, place_m: tuple[float, float]) -> RigidState:
         if start is None:
-            return at_rest((0.0, 0.0, self.world.ground_d_m), 0.0, (0.0, 0.0, 0.0, 0.0))
+            return at_rest((*place_m, self.world.ground_d_m), 0.0, (0.0, 0.0, 0.0, 0.0))
         p, yaw = start
         mass = self._body.mass_kg
         load = mass * (self._body.gravity_m_s2 + self._body.drag_1_s * self._wind.air_m_s[2])

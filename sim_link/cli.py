@@ -6,6 +6,7 @@ import gc
 import json
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from math import radians
@@ -29,6 +30,7 @@ from .cli_values import (
 )
 from .fault_file import load as load_faults
 from .fault_keys import FaultError
+from .fleet import SPACING_M, SYSTEMS_MAX, Fleet, siblings
 from .parameters import ParameterError, Parameters
 from .peer import Peer, PeerOptions
 from .rotation import Vec3
@@ -68,6 +70,8 @@ def _root(
 def run(
     vehicle: Annotated[str, typer.Option(help="Vehicle file, or the name of a bundled one.")] = "paper",
     instance: Annotated[int, typer.Option(min=0, max=249, help="Number i: system id 1 + i, ports shifted by i.")] = 0,
+    count: Annotated[int, typer.Option(min=1, metavar="N", help="So many vehicles, from instance i on.")] = 1,
+    spacing: Annotated[float, typer.Option(metavar="M", help="Between two of --count, eastwards.")] = SPACING_M,
     start: Annotated[
         str | None, typer.Option(metavar="N,E,D[,YAW_DEG]", help="Wait in the air there, armed, in Hold.")
     ] = None,
@@ -113,6 +117,10 @@ def run(
     Companion link: from port 14580 + i to 127.0.0.1:14540 + i (from i = 10 on 24580 + i and 24540 + i). Ground link:
     18570 + i to 14550. The truth goes to 19410 + i. Exit code 2: bad input, or a port in use.
 
+    With --count N there are N vehicles, side by side, each with its own system id, ports, seed (the next one) and, with
+    --truth FILE.csv, file (FILE-2.csv for system 2). Ports given by hand are the first vehicle's. In lockstep each
+    follows its own companion.
+
     With --truth FILE.csv, what went wrong and when is written to FILE.faults.csv. docs/faults.md lists what can.
     """
     stop = Stop(with_parent)
@@ -136,37 +144,61 @@ def run(
             parameters=_parameters(param or [], px4),
             faults=() if faults is None else load_faults(faults, px4),
         )
-        peer_options = _peer_options(
-            instance,
-            companion=(port, remote_port),
-            ground=(ground_port, ground_remote_port) if ground else None,
-            truth_port=truth_port,
-            truth_stream=truth_stream,
-            lockstep=lockstep,
-            speed=speed,
-        )
+        if instance + count > SYSTEMS_MAX:
+            raise InputError(f"--count {count}: from --instance {instance} on there are {SYSTEMS_MAX - instance}")
+        all_options = siblings(options, count, number(spacing, "--spacing"))
+        all_ports = [
+            _peer_options(
+                instance,
+                k,
+                companion=(port, remote_port),
+                ground=(ground_port, ground_remote_port) if ground else None,
+                truth_port=truth_port,
+                truth_stream=truth_stream,
+                lockstep=lockstep,
+                speed=speed,
+            )
+            for k in range(count)
+        ]
         if duration is not None:
             number(duration, "--duration", above=0.0)
         _warm_up(options)
-        peer = Peer(Vehicle(options), peer_options, stopped=stop, notice=tell)
+        runner, peers = _open([Vehicle(o) for o in all_options], all_ports, stop)
         if truth is not None:
-            peer.log_truth(TruthLog(truth))
-            peer.vehicle.faults.log_to(truth.with_suffix(FAULTS_SUFFIX))
+            _log_truth(peers, truth)
     except (InputError, VehicleFileError, VehicleError, ParameterError, FaultError, ImportError) as error:
         refuse(str(error))
     except OSError as error:  # a port, or the truth file
         refuse(str(error) if error.strerror is None else f"{error.filename}: {error.strerror}")
-    _announce(peer, json_ready)
+    _announce(peers, json_ready)
     gc.collect()
     gc.freeze()
     try:
-        peer.run(duration)
+        runner.run(duration)
     finally:
-        peer.close()
+        runner.close()
+
+
+def _open(vehicles: list[Vehicle], ports: list[PeerOptions], stop: Stop) -> tuple[Peer | Fleet, Sequence[Peer]]:
+    """Open the sockets; gives what runs the vehicles, and the peer of each."""
+    if len(vehicles) == 1:
+        peer = Peer(vehicles[0], ports[0], stopped=stop, notice=tell)
+        return peer, [peer]
+    fleet = Fleet(list(zip(vehicles, ports, strict=True)), stopped=stop, notice=tell)
+    return fleet, fleet.members
+
+
+def _log_truth(peers: Sequence[Peer], path: Path) -> None:
+    """Begin the truth file of each vehicle, and that of its faults beside it."""
+    for peer in peers:
+        own = path if len(peers) == 1 else path.with_stem(f"{path.stem}-{peer.vehicle.system}")
+        peer.log_truth(TruthLog(own))
+        peer.vehicle.faults.log_to(own.with_suffix(FAULTS_SUFFIX))
 
 
 def _peer_options(
-    instance: int,
+    first: int,
+    k: int,
     *,
     companion: tuple[int | None, int | None],
     ground: tuple[int | None, int] | None,
@@ -175,28 +207,53 @@ def _peer_options(
     lockstep: bool,
     speed: float,
 ) -> PeerOptions:
-    """Check ports and time; a port that is None is PX4's for the instance. `companion`, `ground`: own, spoken to."""
+    """Check the ports and the time of the vehicle k instances after the first.
+
+    A port that is None is PX4's for the instance, one that is given the first vehicle's; 0 stays 0. `companion`,
+    `ground`: own, spoken to. All vehicles speak to the same ground station.
+    """
+    instance = first + k
     shift = instance if instance < _SITL_SECOND_RANGE else instance + 10_000
-    port, remote_port = companion
+    port, remote_port = _after(companion[0], k), _after(companion[1], k)
     own_ground, remote_ground = ground or (None, 0)
     ground_default = 0 if port == 0 else 18570 + instance
     return PeerOptions(
         port=port_or(port, 14580 + shift, "--port"),
         remote_port=port_or(remote_port, 14540 + shift, "--remote-port"),
-        ground_port=port_or(own_ground, ground_default, "--ground-port") if ground is not None else None,
+        ground_port=port_or(_after(own_ground, k), ground_default, "--ground-port") if ground is not None else None,
         ground_remote_port=port_or(remote_ground, 0, "--ground-remote-port"),
-        truth_port=port_or(truth_port, 19410 + instance, "--truth-port") if truth_stream else None,
+        truth_port=port_or(_after(truth_port, k), 19410 + instance, "--truth-port") if truth_stream else None,
         lockstep=lockstep,
         speed=number(speed, "--speed", above=0.0),
     )
 
 
-def _announce(peer: Peer, as_json: bool) -> None:
-    """Say that the vehicle is there, and where."""
+def _after(port: int | None, k: int) -> int | None:
+    """Give the port k after one that is given; any free one stays that."""
+    return port + k if port else port
+
+
+def _announce(peers: Sequence[Peer], as_json: bool) -> None:
+    """Say that the vehicles are there, and where. One is told as one, several as a list."""
+    if as_json:
+        told = [_address(peer) for peer in peers]
+        more = told[0] if len(told) == 1 else {"vehicles": told}
+        typer.echo(json.dumps({"ready": True, "pid": os.getpid(), **more}))
+    else:
+        for peer in peers:
+            options, vehicle = peer.options, peer.vehicle
+            time = "in lockstep" if options.lockstep else f"at {options.speed:g} times real time"
+            typer.echo(
+                f"{vehicle.options.vehicle.name}, system {vehicle.system}, {time}: "
+                f"companion link 127.0.0.1:{peer.companion.port} -> {options.remote_port or 'whoever speaks first'}"
+            )
+    sys.stdout.flush()
+
+
+def _address(peer: Peer) -> dict[str, object]:
+    """Give what a program needs to find a vehicle."""
     options, vehicle = peer.options, peer.vehicle
-    ready = {
-        "ready": True,
-        "pid": os.getpid(),
+    return {
         "system_id": vehicle.system,
         "port": peer.companion.port,
         "remote_port": options.remote_port,
@@ -206,16 +263,6 @@ def _announce(peer: Peer, as_json: bool) -> None:
         "state_rate_hz": 1e6 / vehicle.period_us,
         "lockstep": options.lockstep,
     }
-    if as_json:
-        line = json.dumps(ready)
-    else:
-        time = "in lockstep" if options.lockstep else f"at {options.speed:g} times real time"
-        line = (
-            f"{vehicle.options.vehicle.name}, system {vehicle.system}, {time}: "
-            f"companion link 127.0.0.1:{peer.companion.port} -> {options.remote_port or 'whoever speaks first'}"
-        )
-    typer.echo(line)
-    sys.stdout.flush()
 
 
 def _warm_up(options: VehicleOptions) -> None:

@@ -347,9 +347,13 @@ class Offboard:
 
 def _given(vector: Vec3, mask: int, first_bit: int) -> Vec3:
     """Give a vector with NaN on the axes that the mask ignores, or that hold no number."""
-    kept = [math.nan if mask & first_bit << k else value for k, value in enumerate(vector)]
-    x, y, z = (value if math.isfinite(value) else math.nan for value in kept)
-    return x, y, z
+    nan, is_number = math.nan, math.isfinite
+    x, y, z = vector
+    return (
+        nan if mask & first_bit or not is_number(x) else x,
+        nan if mask & first_bit << 1 or not is_number(y) else y,
+        nan if mask & first_bit << 2 or not is_number(z) else z,
+    )
 
 
 def _whole_vector(vector: Vec3, mask: int, first_bit: int) -> Vec3:
@@ -370,6 +374,11 @@ def _is_empty(vector: Vec3) -> bool:
 
 def _is_flyable(setpoint: PositionSetpoint) -> bool:
     """Tell whether the position controller has something on every axis, and x only together with y."""
-    axes = zip(setpoint.p, setpoint.v, setpoint.a, strict=True)
-    complete = all(any(map(math.isfinite, axis)) for axis in axes)
-    return complete and all(math.isfinite(x) == math.isfinite(y) for x, y, _ in (setpoint.p, setpoint.v, setpoint.a))
+    is_number = math.isfinite
+    north = east = down = False
+    for x, y, z in (setpoint.p, setpoint.v, setpoint.a):
+        has_x, has_y = is_number(x), is_number(y)
+        if has_x is not has_y:
+            return False
+        north, east, down = north or has_x, east or has_y, down or is_number(z)
+    return north and east and down

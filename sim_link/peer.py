@@ -24,9 +24,9 @@ from .vehicle import Vehicle
 
 PATIENCE_S = 1.0
 """Wall time that the clock waits for a companion's answer; then it runs on at real time until one answers again."""
-_HEARTBEAT_WALL_S = 0.2
+HEARTBEAT_WALL_S = 0.2
 """Between heartbeats while the clock stands still and waits for the first companion."""
-_SLICE_S = 0.1
+SLICE_S = 0.1
 """Longest single wait, so that a stop is noticed."""
 _SPIN_S = 2.0e-4
 """Wall time for which an answer is polled for before the process sleeps: waking up takes longer than most answers."""
@@ -76,6 +76,8 @@ class Peer:
         *,
         stopped: Callable[[], bool] = _never,
         notice: Callable[[str], None] = _silent,
+        poll: select.poll | None = None,
+        sharers: int = 1,
     ) -> None:
         """Open the sockets.
 
@@ -85,6 +87,8 @@ class Peer:
             stopped: asked often; once it says yes, `run` returns.
             notice: gets a sentence when the companion falls silent in lockstep, when it is back, and when a fault
                 begins or ends.
+            poll: where the sockets register; None: one of its own.
+            sharers: vehicles that share the thread (see `fleet`), and with it what is heard per state.
 
         Raises:
             PortError: a port is in use.
@@ -116,10 +120,10 @@ class Peer:
         self._stopped = stopped
         self._notice = notice
         self._endpoints = [self.companion] if self.ground is None else [self.companion, self.ground]
-        self._poll = select.poll()
+        self._poll = select.poll() if poll is None else poll
         for endpoint in self._endpoints:
             self._poll.register(endpoint.fileno(), select.POLLIN)
-        per_state = allowance(vehicle.period_us * 1e-6 / self._speed)
+        per_state = allowance(self.state_wall_s, sharers)
         self._intakes = [Intake(endpoint, per_state) for endpoint in self._endpoints]
         self._muted: list[int] = []
         """Sockets whose allowance is used up: nobody waits for them before the next state."""
@@ -206,22 +210,27 @@ class Peer:
         while not self._stopped():
             now_s = time.monotonic()
             if now_s >= next_heartbeat_s:
-                next_heartbeat_s = now_s + _HEARTBEAT_WALL_S
+                next_heartbeat_s = now_s + HEARTBEAT_WALL_S
                 self.vehicle.heartbeat()
                 self._flush()
-            timeout_s = max(0.0, min(_SLICE_S, next_heartbeat_s - now_s))
-            if self._poll.poll(timeout_s * 1e3):
-                self._refill()
-                self._hear_ground()
-                datagram = self.companion.receive()
-                if datagram is not None and datagram[0]:
-                    if datagram[0][0].msg_id == ID_SERIAL_CONTROL:
-                        self._act(*datagram)
-                        continue
-                    self._waiting.append(datagram)
-                    self._started = True
-                    return True
+            timeout_s = max(0.0, min(SLICE_S, next_heartbeat_s - now_s))
+            if self._poll.poll(timeout_s * 1e3) and self._hear_first():
+                return True
         return False
+
+    def _hear_first(self) -> bool:
+        """Take the companion's first message, which counts after the first state. False: there is none yet."""
+        self._refill()
+        self._hear_ground()
+        datagram = self.companion.receive()
+        if datagram is None or not datagram[0]:
+            return False
+        if datagram[0][0].msg_id == ID_SERIAL_CONTROL:
+            self._act(*datagram)
+            return False
+        self._waiting.append(datagram)
+        self._started = True
+        return True
 
     def _wait_for_answer(self) -> bool:
         """Act on what comes until the companion has answered this state, for a bounded time. False: stopped before.
@@ -236,12 +245,10 @@ class Peer:
         while not self._answered:
             left_s = give_up_s - time.monotonic()
             if left_s <= 0.0:
-                self.synchronous = False
-                self._deadline_s = time.monotonic()
-                self._notice(f"no answer from the companion for {PATIENCE_S:g} s: going on at real time")
+                self._lose_patience()
                 break
             stopped = self._stopped()
-            self._serve(0.0 if stopped else min(left_s, _SLICE_S))
+            self._serve(0.0 if stopped else min(left_s, SLICE_S))
             if stopped and not self._answered:
                 return False
             self._spin(_SPIN_NEXT_S)
@@ -287,14 +294,20 @@ class Peer:
             left_s = self._deadline_s - time.monotonic()
             if left_s <= 0.0 or self._stopped():
                 return
-            self._serve(min(left_s, _SLICE_S))
+            self._serve(min(left_s, SLICE_S))
 
     def _set_deadline(self) -> None:
         """Set the time of the next state; lateness beyond a limit is let go."""
-        self._deadline_s += self.vehicle.period_us * 1e-6 / self._speed
+        self._deadline_s += self.state_wall_s
         now_s = time.monotonic()
         if now_s - self._deadline_s > _LATE_MAX_S:
             self._deadline_s = now_s
+
+    def _lose_patience(self) -> None:
+        """Let the clock run without the companion."""
+        self.synchronous = False
+        self._deadline_s = time.monotonic()
+        self._notice(f"no answer from the companion for {PATIENCE_S:g} s: going on at real time")
 
     def _return_to_lockstep(self) -> None:
         """Let the clock wait for the companion again; what it has sent after its answer belongs to the next state."""
@@ -305,9 +318,9 @@ class Peer:
         self._notice("the companion answers again: back in lockstep")
 
     @property
-    def _speed(self) -> float:
-        """Vehicle time per wall time, while no companion moves the clock."""
-        return 1.0 if self.options.lockstep else self.options.speed
+    def state_wall_s(self) -> float:
+        """Wall time between two states, while no companion moves the clock."""
+        return self.vehicle.period_us * 1e-6 / (1.0 if self.options.lockstep else self.options.speed)
 
     def _serve(self, timeout_s: float) -> None:
         """Wait until something is received, and act on it."""

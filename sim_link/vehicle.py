@@ -108,6 +108,8 @@ class VehicleOptions:
     """System id is 1 + instance."""
     start: tuple[Vec3, float] | None = None
     """Position NED [m] and yaw [rad] at which it waits in the air, armed, in Hold; None: on the ground, disarmed."""
+    place_m: tuple[float, float] = (0.0, 0.0)
+    """Where it stands on the ground, north and east [m], unless it starts in the air."""
     seed: int = 1
     """Of everything random in it."""
     px4: str = "1.18"
@@ -139,7 +141,13 @@ class Vehicle:
         self._untouched = Parameters(options.px4, from_file)
         self.parameters = Parameters(options.px4, from_file | dict(options.parameters))
         self.airframe = Airframe(
-            file, options.world, seed=options.seed, engine=options.engine, start=options.start, px4=options.px4
+            file,
+            options.world,
+            seed=options.seed,
+            engine=options.engine,
+            start=options.start,
+            place_m=options.place_m,
+            px4=options.px4,
         )
         self._steps_per_control = max(1, int(_CONTROL_PERIOD_S / (self.airframe.dt_us * 1e-6)))
         self.period_us = self.steps_per_tick * self.airframe.dt_us

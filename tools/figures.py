@@ -13,6 +13,8 @@ import argparse
 import json
 import os
 import platform
+import random
+import socket
 import statistics
 import subprocess
 import sys
@@ -27,10 +29,18 @@ from companion.config import load_flight
 from companion.control.types import State
 from companion.flight.course import Course
 from companion.flight.tracker import Tracker, kernels
+from companion.ground.exchange import OWN_COMPONENT, OWN_SYSTEM
+from companion.ground.ftp import crc32
+from companion.ground.upload import Files
 from companion.link import codec
+from companion.link.framing import Frame
+from companion.link.wire import Wire
 from companion.record.summary import without_wall_clock
 from companion.record.tlog import read_tlog
+from companion.trajectory.anchored import Trajectory, anchored
+from companion.trajectory.feasibility import check
 from companion.trajectory.load import load
+from companion.trajectory.waypoints import Waypoint, plan, plan_limits
 
 
 def demo(folder: Path, *options: str) -> dict[str, Any]:
@@ -157,6 +167,111 @@ def steps() -> list[tuple[str, str, str]]:
     return rows
 
 
+def machine() -> list[tuple[str, str, str]]:
+    """What times below can be put in relation to: pymavlink's parse of one ODOMETRY, and a loop of plain arithmetic."""
+    library = codec.dialect()
+    message = library.MAVLink_odometry_message(
+        *(1, 1, 1, 1.0, 2.0, 3.0, [1.0, 0.0, 0.0, 0.0], 0.1, 0.2, 0.3, 0.01, 0.02, 0.03, [0.0] * 21, [0.0] * 21)
+    )
+    frame = message.pack(library.MAVLink(None, srcSystem=1, srcComponent=1))
+    parser = library.MAVLink(None)
+
+    def arithmetic(_: int) -> float:
+        x = 0.0
+        for i in range(100):
+            x = 0.5 * x + i
+        return x
+
+    return [
+        (
+            "this machine: pymavlink parses one ODOMETRY, median",
+            "",
+            f"{median_us(lambda i: parser.parse_buffer(frame)):.1f} us",
+        ),
+        ("this machine: 100 rounds of x = 0.5 x + i, median", "", f"{median_us(arithmetic):.1f} us"),
+    ]
+
+
+def planning(repeats: int) -> list[tuple[str, str, str]]:
+    """A path through 500 waypoints, planned with its times and checked as before a flight."""
+    vehicle = load_flight("eight").vehicle
+    limits = plan_limits(vehicle, wind_m_s=1.0)
+    rng = random.Random(1)
+    at = [0.0, 0.0, -20.0]
+    waypoints = []
+    for _ in range(500):
+        at = [x + rng.gauss(0.0, size) for x, size in zip(at, (6.0, 6.0, 1.5), strict=True)]
+        waypoints.append(Waypoint((at[0], at[1], at[2])))
+    planned, checked, violations = [], [], 0
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        shape = plan(waypoints, limits)
+        middle = time.perf_counter()
+        path = anchored(Trajectory(name="500", shape=shape, duration_s=shape.own_duration_s), (0.0, 0.0, 0.0), None)
+        violations += len(check(path, limits.reference, limits.model))
+        planned.append(middle - begin)
+        checked.append(time.perf_counter() - middle)
+    both = [a + b for a, b in zip(planned, checked, strict=True)]
+    text = f"{statistics.median(both):.2f} s of {repeats} (plan alone {statistics.median(planned):.2f} s)"
+    if violations:
+        text += f", {violations} VIOLATIONS"
+    return [("500 waypoints planned, timed and checked, median", "< 2 s", text)]
+
+
+class Lossy:
+    """A link that loses a share of what goes either way."""
+
+    def __init__(self, wire: Wire, loss: float, seed: int) -> None:
+        self._wire, self._loss, self._rng = wire, loss, random.Random(seed)
+
+    def send(self, msgid: int, payload: bytes) -> bool:
+        return self._rng.random() < self._loss or self._wire.send(msgid, payload)
+
+    def receive(self, timeout_s: float) -> list[Frame]:
+        return [frame for frame in self._wire.receive(timeout_s) if self._rng.random() >= self._loss]
+
+
+def upload(port: int, content: bytes, loss: float, seed: int) -> tuple[float, bool]:
+    """Brings 1 MB to a companion; returns the time until it had all of it [s], and whether it is what was sent."""
+    arrived: list[float] = []
+    with Wire.open(f"udpout:127.0.0.1:{port}", system_id=OWN_SYSTEM, component_id=OWN_COMPONENT) as wire:
+        begin = time.perf_counter()
+        files = Files(Lossy(wire, loss, seed))
+        verdict = files.upload_bytes(
+            content, "long.csv", progress=lambda there, _: arrived.append(time.perf_counter() - begin)
+        )
+    return arrived[-1], (verdict.size_bytes, verdict.crc32) == (len(content), crc32(content))
+
+
+def transfers(base: Path, repeats: int) -> list[tuple[str, str, str]]:
+    """Uploads to `companion serve` over loopback; the file's check, which follows, is not counted."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground,
+    ):
+        vehicle.bind(("127.0.0.1", 0))
+        ground.bind(("127.0.0.1", 0))
+        vehicle_port, port = int(vehicle.getsockname()[1]), int(ground.getsockname()[1])
+    command = [sys.executable, "-m", "companion", "serve", "--vehicle", "paper", "--folder", str(base / "stored")]
+    command += ["--connect", f"udpin:127.0.0.1:{vehicle_port}", "--ground", f"udpin:127.0.0.1:{port}"]
+    rows = []
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=base)
+    try:
+        for loss, reach in ((0.0, "< 3 s, intact"), (0.1, "complete, intact")):
+            taken, intact = [], True
+            for i in range(repeats):
+                content = random.Random(i).randbytes(500_000).hex().encode()
+                time_s, same = upload(port, content, loss, i)
+                taken.append(time_s)
+                intact = intact and same
+            text = f"{statistics.median(taken):.2f} s of {repeats}, {'intact' if intact else 'DAMAGED'}"
+            rows.append((f"1 MB uploaded over loopback, {100 * loss:.0f} % loss each way, median", reach, text))
+    finally:
+        process.terminate()
+        process.wait(timeout=20)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one flight per kind")
@@ -165,7 +280,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         base = arguments.out or Path(temporary)
         base.mkdir(parents=True, exist_ok=True)
-        rows = steps() + speeds(base, 1 if arguments.quick else 3) + flights(base, arguments.quick)
+        rows = (
+            machine()
+            + steps()
+            + machine()[:1]
+            + planning(2 if arguments.quick else 7)
+            + transfers(base, 1 if arguments.quick else 5)
+            + speeds(base, 1 if arguments.quick else 3)
+            + flights(base, arguments.quick)
+        )
         rows += [] if arguments.quick else wind(base)
     print(f"Python {platform.python_version()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
     print("| figure | reach | seen |\n|---|---|---|")

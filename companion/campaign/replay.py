@@ -1,9 +1,9 @@
 """A recorded flight's states through today's controller: what it would have commanded, beside what was sent.
 
-The states, their stamps and how the flight was engaged come from the flight's folder; the reference is planned anew
-from them. With the folder's own configuration and the same program the commands are the recorded ones to the last bit,
-so every difference is one of gains, vehicle file or code. The states are those of the old commands: a replay says how
-two controllers answer the same states, not how the new one would have flown.
+The states, their stamps and how the flight was engaged come from the flight's folder or log; the reference is planned
+anew from them. With the flight's own configuration and the same program the commands are the recorded ones to the last
+bit, so every difference is one of gains, vehicle file or code. The states are those of the old commands: a replay says
+how two controllers answer the same states, not how the new one would have flown.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from companion.config import Flight, build_flight, read_toml
+from companion.config import Flight, build_flight, with_paths
 from companion.control import flat
 from companion.control.output import thrust_of
 from companion.control.types import State
@@ -24,9 +24,9 @@ from companion.errors import InputError
 from companion.flight.controller import controller_of
 from companion.flight.course import ZERO, Course
 from companion.flight.phases import Engagement
-from companion.flight.tracker import Kernels
+from companion.flight.tracker import Kernels, Tracker
 from companion.record.flight_record import FlightRecord
-from companion.record.folder import CONFIGURATION_FILE, read_summary
+from companion.record.flight_source import FlightSource, read_source
 from companion.trajectory.load import of_flight
 
 Array = npt.NDArray[np.float64]
@@ -86,33 +86,37 @@ class Replay:
 
 
 def replay(
-    folder: Path, engine: Kernels, changed: Flight | None = None, progress: Callable[[float], None] = lambda share: None
+    flown: FlightSource | Path,
+    engine: Kernels,
+    changed: Flight | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Replay:
     """Compute the commands of a recorded flight again.
 
     Args:
-        folder: the flight's folder.
+        flown: the flight, or its folder or log.
         engine: the arithmetic.
-        changed: another configuration (gains, vehicle); None: the folder's own.
+        changed: another configuration (gains, vehicle); None: the flight's own.
         progress: called now and then with the share that is done.
 
     Raises:
-        InputError: the folder holds no flight that can be replayed.
+        InputError: it is no flight that can be replayed.
         RefusedError: with the changed configuration the course cannot be flown.
     """
-    configuration = folder / CONFIGURATION_FILE
-    flight = changed or build_flight(read_toml(configuration), str(configuration))
+    source = flown if isinstance(flown, FlightSource) else read_source(flown)
+    flight = changed or build_flight(configuration_of(source), source.configuration_name)
     if flight.output.controller != "law":
-        raise InputError(f"{folder}: PX4's own controller flew; a replay computes the law's commands")
-    record = FlightRecord.load(folder)
-    engagement = _engagement(folder)
+        raise InputError(f"{source.path}: PX4's own controller flew; a replay computes the law's commands")
+    record = source.record
+    engagement = _engagement(source)
     if not len(record):
-        raise InputError(f"{folder}: the record is empty, the flight was never engaged")
+        raise InputError(f"{source.path}: the record is empty, the flight was never engaged")
     trajectory = of_flight(flight)
     course = Course(trajectory, flight.vehicle, engagement.hold_point_m, engagement.yaw_rad, engagement.home_m)
     for ramp in engagement.ramps:
         course.change_pace(ramp)
     tracker = controller_of(flight, engine)
+    ways = list(engagement.transitions) if changed is None else []  # other gains are compared as they stand
     rows = record.rows
     begin_s = engagement.at_s
     tracker.begin(State(ZERO, ZERO, engagement.attitude, ZERO), engagement.thrust_n)
@@ -120,6 +124,9 @@ def replay(
     table = np.column_stack([rows[:, 0], record.columns(*_STATE)])
     for index, (stamp_s, *x) in enumerate(table.tolist()):
         state = State((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8], x[9]), (x[10], x[11], x[12]))
+        if ways and stamp_s >= ways[0].begin_s and isinstance(tracker, Tracker):
+            way = ways.pop(0)
+            tracker.retune(way.new, way.duration_s)
         out = tracker.step(stamp_s, state, lambda t: course.at(t - begin_s))
         n = out.numbers
         values = (thrust_of(out.setpoint), n[flat.TOTAL], *n[flat.RATES], *n[flat.TAU], *n[flat.B_HAT])
@@ -133,12 +140,19 @@ def replay(
 _STATE: Final = ("p_n", "p_e", "p_d", "v_n", "v_e", "v_d", "q_w", "q_x", "q_y", "q_z", "w_x", "w_y", "w_z")
 
 
-def _engagement(folder: Path) -> Engagement:
-    """How the flight began, from its summary. Raises InputError."""
-    entry = read_summary(folder).get("engagement")
+def configuration_of(source: FlightSource) -> dict[str, Any]:
+    """The contents of the flight's flight.toml, with the paths in it made absolute. Raises InputError."""
+    if not source.configuration:
+        raise InputError(f"{source.configuration_name}: there is no configuration, which a replay needs")
+    return with_paths(source.configuration, source.folder)
+
+
+def _engagement(source: FlightSource) -> Engagement:
+    """How the flight began. Raises InputError."""
+    entry = source.summary.get("engagement")
     if entry is None:
-        raise InputError(f"{folder}: the summary does not say how the flight was engaged; it never was, or is too old")
+        raise InputError(f"{source.path}: does not say how the flight was engaged; it never was, or is too old")
     try:
         return Engagement.from_numbers(entry)
     except (TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{folder}: summary.json: engagement: {error}; give the folder of a flight") from None
+        raise InputError(f"{source.path}: engagement: {error}; it cannot be replayed") from None

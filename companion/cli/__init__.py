@@ -23,6 +23,7 @@ COMMANDS = {
     "demo": "Fly the paper's figure of eight on the bundled vehicle.",
     "fly": "Fly a trajectory on a vehicle that is already there.",
     "check": "Check that trajectories can be flown: continuity, limits, margins.",
+    "mission": "Download the autopilot's mission and geofence into a file to plan through.",
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
     "upload": "Bring a trajectory to the vehicle and get its verdict.",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from companion.control.types import Vec3
     from companion.flight.inspection import Inspection
     from companion.trajectory.anchored import Anchored, Trajectory
+    from companion.trajectory.fence import Fence
 
 EXAMPLE = "Example: companion check paper --vehicle paper"
 
@@ -68,7 +69,8 @@ def run(
     trajectories = [
         load(file, time_scale, vehicle=flown_by, frame=own) for file, own in zip(files, frames, strict=True)
     ]
-    checked = [_check(trajectory, flown_by, held, other_fence, height_min) for trajectory in trajectories]
+    gains = _gains(flown_by)
+    checked = [_check(trajectory, flown_by, held, other_fence, height_min, gains) for trajectory in trajectories]
     near = _separation(trajectories, separation)
     refused = any(document["problems"] for _, document in checked) or bool(near and near["refused"])
     if as_json:
@@ -121,14 +123,30 @@ def _hold(trajectory: Trajectory, held: Start | None) -> Start:
     return Start(position_m=begin.p, yaw_deg=degrees(begin.yaw))
 
 
+def _gains(vehicle: Vehicle) -> list[dict[str, Any]]:
+    """What speaks against the vehicle's gains: nothing is flown with such."""
+    from companion.errors import RefusedError
+    from companion.flight.preflight import gate_gains
+
+    try:
+        gate_gains(vehicle)
+    except RefusedError as error:
+        return [{"name": "gains", "at_s": None, "sentence": str(error)}]
+    return []
+
+
 def _check(
-    trajectory: Trajectory, vehicle: Vehicle, held: Start | None, fence: Any, height_min: float
+    trajectory: Trajectory,
+    vehicle: Vehicle,
+    held: Start | None,
+    fence: Fence | None,
+    height_min: float,
+    gains: list[dict[str, Any]],
 ) -> tuple[Inspection, dict[str, Any]]:
     """One trajectory: what was found, and the same as a document."""
     from companion.config import Flight
     from companion.errors import RefusedError
     from companion.flight.inspection import inspect
-    from companion.flight.preflight import gate_gains
     from companion.frames import radians
 
     hold = _hold(trajectory, held)
@@ -142,10 +160,7 @@ def _check(
     )
     document = _document(inspection, hold)
     problems: list[dict[str, Any]] = document["problems"]
-    try:
-        gate_gains(vehicle)
-    except RefusedError as error:
-        problems.append({"name": "gains", "at_s": None, "sentence": str(error)})
+    problems += gains
     if not any(problem["name"] in {"not_finite", "join"} for problem in problems):
         flight = Flight(name=trajectory.name, vehicle=vehicle, trajectory=trajectory.name, start=hold)
         try:
@@ -204,7 +219,7 @@ def _finite(value: Any) -> Any:
 
 def _separation(trajectories: list[Trajectory], least_m: float) -> dict[str, Any] | None:
     """How near several trajectories come, in the coordinates of their files, when all begin at once."""
-    from companion.flight.inspection import separation
+    from companion.flight.surroundings import separation
 
     found = separation(_together(trajectories))
     if found is None:

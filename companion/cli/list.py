@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 
 from companion.cli.common import JsonOption
-from companion.cli.upload import DEFAULT_TO, SystemOption, ToOption
+from companion.cli.operate import TO_DEFAULT, ToOption
+from companion.cli.upload import SystemOption
 
 EXAMPLE = "Example: companion list --to udpout:192.168.1.10:14590"
 
 
-def run(to: ToOption = DEFAULT_TO, system: SystemOption = None, as_json: JsonOption = False) -> None:
+def run(to: ToOption = TO_DEFAULT, system: SystemOption = None, as_json: JsonOption = False) -> None:
     """Lists what is stored."""
     from companion.ground.upload import Files
 

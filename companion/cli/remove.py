@@ -8,14 +8,15 @@ from typing import Annotated
 import typer
 
 from companion.cli.common import JsonOption, say
-from companion.cli.upload import DEFAULT_TO, SystemOption, ToOption
+from companion.cli.operate import TO_DEFAULT, ToOption
+from companion.cli.upload import SystemOption
 
 EXAMPLE = "Example: companion remove lap.csv --to udpout:192.168.1.10:14590"
 
 
 def run(
     name: Annotated[str, typer.Argument(help="As companion list shows it.")],
-    to: ToOption = DEFAULT_TO,
+    to: ToOption = TO_DEFAULT,
     system: SystemOption = None,
     as_json: JsonOption = False,
 ) -> None:

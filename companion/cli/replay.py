@@ -19,7 +19,7 @@ EXAMPLE = "Example: companion replay flights/20260801T120000Z-paper --set contro
 
 
 def run(
-    folder: Annotated[Path, typer.Argument(help="A flight's folder.")],
+    flight: Annotated[Path, typer.Argument(metavar="FLIGHT", help="A flight's folder, or its flight.ulg.")],
     vehicle: VehicleOption = None,
     settings: Annotated[
         list[str] | None,
@@ -35,24 +35,22 @@ def run(
     from rich.console import Console
     from rich.progress import Progress
 
-    from companion.campaign.replay import replay
-    from companion.config import build_flight, read_toml
+    from companion.campaign.replay import configuration_of, replay
+    from companion.config import build_flight
     from companion.flight.tracker import kernels
-    from companion.record.folder import CONFIGURATION_FILE
+    from companion.record.flight_source import read_source
 
-    path = folder / CONFIGURATION_FILE
-    if not path.is_file():
-        raise InputError(f"{path}: there is no flight; give the folder of one")
+    source = read_source(flight)
     changed = None
     if vehicle is not None or settings:
-        document: dict[str, Any] = read_toml(path)
+        document = configuration_of(source)
         document.update(vehicle_changes(vehicle))
         for setting in settings or []:
             _set(document["vehicle"], setting)
-        changed = build_flight(document, str(path))
+        changed = build_flight(document, source.configuration_name)
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("replaying", total=1.0)
-        done = replay(folder, kernels(engine), changed, lambda share: bar.update(task, completed=share))
+        done = replay(source, kernels(engine), changed, lambda share: bar.update(task, completed=share))
     differences = done.differences
     if page is not None:
         from companion.record.replay_page import write_page
@@ -62,6 +60,8 @@ def run(
         rows = [vars(found) for found in differences]
         print(json.dumps({"identical": done.identical, "steps": len(done.time_s), "differences": rows}, indent=2))
         return
+    for sentence in source.missing:
+        say(f"  {sentence}")
     verdict = "every command is the recorded one" if done.identical else "the commands differ"
     say(f"{done.flight.name}: {len(done.time_s)} states replayed, {verdict}")
     for found in differences:

@@ -45,6 +45,9 @@ def run(
     ] = None,
     output: Annotated[str | None, typer.Option("--output", help='"rates", "attitude" or "actuators".')] = None,
     controller: ControllerOption = None,
+    reports: Annotated[
+        bool, typer.Option("--reports/--no-reports", help="Build report.html after every flight, at a low priority.")
+    ] = True,
     engine: EngineOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
@@ -64,6 +67,7 @@ def run(
         trajectories=str(_usable(folder, "--folder")),
         flights=str(_usable(flights, "--flights")),
         engine=engine,
+        reports=reports,
         flight=_flight(vehicle, flight, controller_changes(controller, output)),
     )
 

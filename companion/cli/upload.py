@@ -12,26 +12,22 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.common import JsonOption, say
+from companion.cli.operate import TO_DEFAULT, ToOption
 
 if TYPE_CHECKING:
     from companion.ground.upload import Verdict
 
 EXAMPLE = "Example: companion upload lap.csv --to udpout:192.168.1.10:14590"
 
-ToOption = Annotated[
-    str,
-    typer.Option("--to", metavar="CONNECTION", help="The vehicle: udpout:HOST:PORT, udpin:HOST:PORT, serial:DEV:BAUD."),
-]
 SystemOption = Annotated[
     int | None,
     typer.Option("--system", metavar="ID", min=1, max=255, help="The vehicle's system id; needed if several answer."),
 ]
-DEFAULT_TO = "udpout:127.0.0.1:14590"
 
 
 def run(
     file: Annotated[str, typer.Argument(help="Trajectory file of any known format, or the name of a bundled one.")],
-    to: ToOption = DEFAULT_TO,
+    to: ToOption = TO_DEFAULT,
     name: Annotated[
         str | None,
         typer.Option("--name", metavar="NAME", help="What to call it there; default: its own name."),

@@ -5,33 +5,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import dist, hypot, inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.config import Vehicle
 from companion.control.types import Reference, Vec3
 from companion.errors import RefusedError
 from companion.flight.course import Course
+from companion.flight.surroundings import HEIGHT_MIN_M, Margin, Problem, place_problems
 from companion.trajectory import torque
 from companion.trajectory.anchored import Anchored, Trajectory, anchored
-from companion.trajectory.batch import batch, torque_uses
-from companion.trajectory.batch import quantities as array_quantities
+from companion.trajectory.batch import Batch, batch, torque_uses, uses
+from companion.trajectory.batch import quantities as quantities_of
 from companion.trajectory.feasibility import USE_TOLERANCE, ViolationName, check, grid, highest
 from companion.trajectory.fence import Fence
-from companion.trajectory.flatness import BOUNDS, PointMass, ReferenceLimits, demand, quantities, worst_use
+from companion.trajectory.flatness import BOUNDS, PointMass, ReferenceLimits, demand, quantities
 from companion.trajectory.shapes import Joint
-from companion.trajectory.timing import scaled
 from companion.trajectory.vehicle_limits import point_mass, reference_limits
 
 ORIGIN: Vec3 = (0.0, 0.0, 0.0)
-HEIGHT_MIN_M = 0.5
-"""Lowest height above home that a trajectory may ask for, unless told otherwise."""
-
 SNAP_FLOOR_M_S4 = 1e-6
 """Smaller jumps of the fourth derivative are rounding."""
 
@@ -41,7 +36,6 @@ JOIN_JUMP_MAX = 1e-3
 
 PACE_MIN, PACE_MAX = 1e-3, 100.0
 PACE_STEPS = 18
-PACE_SAMPLES = 600
 PACE_MARGIN = 0.999
 """For what lies between the samples that the time scale is worked out from."""
 
@@ -70,21 +64,6 @@ class End(NamedTuple):
     """What its fourth derivative would do as a jump from or to rest."""
     joined: str
     """How the flight gets there or away, for people."""
-
-
-class Margin(NamedTuple):
-    """The nearest that a trajectory comes to something."""
-
-    value_m: float
-    at_s: float
-
-
-class Problem(NamedTuple):
-    """One reason not to fly."""
-
-    name: str
-    at_s: float | None
-    sentence: str
 
 
 @dataclass(frozen=True)
@@ -126,53 +105,6 @@ def reference_problems(trajectory: Trajectory, vehicle: Vehicle) -> list[Problem
         )
         problems.append(Problem("torque", at_s, sentence))
     return problems
-
-
-def place_problems(
-    path: Anchored, fence: Fence | None, height_min_m: float
-) -> tuple[Margin | None, Margin | None, list[Problem]]:
-    """Return the margins to ground and fence of a trajectory in its place, and what speaks against it there.
-
-    Args:
-        path: in coordinates whose origin is home.
-        fence: in the same coordinates, beside the trajectory's own.
-        height_min_m: what the path must stay above, over home.
-    """
-    times_s = grid(path)
-    points = batch(path, times_s).p.T
-    problems = []
-    ground = None if _height_unknown(path.trajectory) else _nearest(times_s, -points[:, 2])
-    if ground is not None and not ground.value_m >= height_min_m:
-        problems.append(
-            Problem(
-                "ground",
-                ground.at_s,
-                f"height above home falls to {ground.value_m:.2f} m at {ground.at_s:.2f} s, at least"
-                f" {height_min_m:g} m are required",
-            )
-        )
-    margins = [part.margins(points) for part in (fence, _own_fence(path.trajectory)) if part is not None]
-    nearest = _nearest(times_s, np.min(margins, axis=0)) if margins else None
-    if nearest is not None and not nearest.value_m > 0.0:
-        sentence = f"leaves the fence by {-nearest.value_m:.2f} m at {nearest.at_s:.2f} s"
-        problems.append(Problem("fence", nearest.at_s, sentence))
-    return ground, nearest, problems
-
-
-def _own_fence(trajectory: Trajectory) -> Fence | None:
-    """The fence that came with a trajectory; where the vehicle happens to be it does not stand."""
-    return None if trajectory.anchor == "here" else trajectory.fence
-
-
-def _height_unknown(trajectory: Trajectory) -> bool:
-    """Whether heights count from sea level while nobody knows how high home is."""
-    origin = trajectory.origin
-    return origin is not None and not origin.altitude_above_home and origin.point.altitude_m == 0.0
-
-
-def _nearest(times_s: Sequence[float], margins: NDArray[np.float64]) -> Margin:
-    at = int(np.argmin(margins))
-    return Margin(float(margins[at]), times_s[at])
 
 
 def inspect(
@@ -221,7 +153,7 @@ def _peaks(path: Anchored, limits: ReferenceLimits, model: PointMass, of: torque
     """Return the extremes of all quantities, found between the samples as well."""
     times_s = grid(path)
     scan = batch(path, times_s)
-    rows = array_quantities(scan, model)
+    rows = quantities_of(scan, model)
     found = []
     for index, bound in enumerate(BOUNDS):
         limit: float = getattr(limits, bound.key)
@@ -301,17 +233,14 @@ def _end(reference: Reference, at_s: float, model: PointMass, of: torque.Body, j
 
 def _time_scale(path: Anchored, limits: ReferenceLimits, model: PointMass, of: torque.Body) -> float | None:
     """Return the fastest time scale that keeps every limit."""
-    times_s = grid(path)
-    every = len(times_s) // PACE_SAMPLES + 1
-    references = [path.at(t_s) for t_s in times_s[::every]]
-    references += [side for joint in path.joints() for side in (joint.before, joint.after)][: 4 * PACE_SAMPLES]
+    found = _with_joints(path)
 
     def fits(pace: float) -> bool:
-        for reference in references:
-            faster = scaled(reference, pace)
-            if worst_use(faster, limits, model) > 1.0 or torque.use(faster, model, of) > 1.0:
-                return False
-        return True
+        p, v, a, j, snap, yaw = found
+        powers = np.array([[1.0], [pace], [pace**2]])
+        faster = Batch(p, pace * v, pace**2 * a, pace**3 * j, pace**4 * snap, powers * yaw)
+        within = uses(quantities_of(faster, model), limits) <= 1.0
+        return bool(within.all() and (torque_uses(faster, model, of) <= 1.0).all())
 
     if not fits(PACE_MIN):
         return None
@@ -325,38 +254,12 @@ def _time_scale(path: Anchored, limits: ReferenceLimits, model: PointMass, of: t
     return PACE_MARGIN * low * path.time_scale
 
 
-def separation(paths: Sequence[Anchored], step_s: float = 0.02) -> tuple[Margin, tuple[int, int]] | None:
-    """Return the nearest that any two of several trajectories come when all begin at once, and which two.
-
-    One that has ended rests where its path runs out to; None for a single one.
-    """
-    if len(paths) < 2:
-        return None
-    end_s = max(path.duration_s for path in paths)
-    count = min(50_000, max(2, round(end_s / step_s)))
-    times_s = np.linspace(0.0, end_s, count + 1).tolist()
-    points = [np.array([path.at(t_s).p for t_s in times_s]) for path in paths]
-    nearest, pair = Margin(inf, 0.0), (0, 1)
-    for i in range(len(paths)):
-        for k in range(i + 1, len(paths)):
-            found = _nearest(times_s, np.sqrt(((points[i] - points[k]) ** 2).sum(axis=1)))
-            if found.value_m < nearest.value_m:
-                nearest, pair = found, (i, k)
-    return nearest, pair
-
-
-def gate_ground(path: Anchored, home: Vec3 | None, height_min_m: float) -> None:
-    """A trajectory in its place in the local frame stays above the ground, as far as home says where that is.
-
-    Raises:
-        RefusedError: it asks for less height above home.
-    """
-    if home is None:
-        return
-    lowest_m, at_s = max((path.at(t_s).p[2], t_s) for t_s in grid(path))
-    height_m = home[2] - lowest_m
-    if not height_m >= height_min_m:
-        raise RefusedError(
-            f"trajectory {path.trajectory.name!r}: height above home falls to {height_m:.2f} m at {at_s:.2f} s, at"
-            f" least {height_min_m:g} m are required (height_min_m of the flight file)"
-        )
+def _with_joints(path: Anchored) -> Batch:
+    """Return a path over its scan, and both sides of its joints."""
+    scan = batch(path, grid(path))
+    sides = [side for joint in path.joints() for side in (joint.before, joint.after)]
+    if not sides:
+        return scan
+    vectors = np.array([side[:5] for side in sides]).transpose(1, 2, 0)
+    yaw = np.array([side[5:] for side in sides]).T
+    return Batch(*(np.concatenate(pair, axis=1) for pair in zip(scan, (*vectors, yaw), strict=True)))

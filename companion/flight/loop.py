@@ -31,9 +31,10 @@ from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
 from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
+from companion.flight.retuning import ParameterChange, Retuning
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
-from companion.flight.tracker import Kernels, TrackerStep
+from companion.flight.tracker import Kernels, Tracker, TrackerStep
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
@@ -158,6 +159,7 @@ class FlightLoop:
         self._host: Host = Alone() if host is None else host
         self._engaged = engaged
         self._tracker = controller_of(flight, compiled)
+        self._retuning = Retuning(self._tracker, notify) if isinstance(self._tracker, Tracker) else None
         self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
         self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
         self._silence_s = max(SILENT_PERIODS * self._interval_s, SILENCE_MIN_S)
@@ -198,6 +200,10 @@ class FlightLoop:
     def order(self, order: Order) -> str:
         """Takes an operator's order; returns "" or why it cannot be followed."""
         return self._sequence.orders.give(order) if self._met else "the flight has not begun"
+
+    def retune(self, change: ParameterChange) -> str:
+        """Takes a change of the parameters; returns "" or why it cannot be followed."""
+        return "" if self._retuning is None else self._retuning.want(change)
 
     @property
     def phase(self) -> Phase:
@@ -479,10 +485,13 @@ class FlightLoop:
         self._engaged(self._engagement)
 
     def _keep_ramps(self) -> None:
-        """Notes and tells how the course's pace was changed."""
+        """Notes and tells how the course's pace and the law's parameters were changed."""
         engagement, course = self._engagement, self._sequence.course
-        if engagement is not None and course is not None and engagement.ramps != course.ramps:
-            self._engagement = replace(engagement, ramps=course.ramps)
+        if engagement is None or course is None:
+            return
+        ways = tuple(self._tracker.transitions) if isinstance(self._tracker, Tracker) else ()
+        if engagement.ramps != course.ramps or len(engagement.transitions) != len(ways):
+            self._engagement = replace(engagement, ramps=course.ramps, transitions=ways)
             self._engaged(self._engagement)
 
     def _track(self, state: VehicleState, skipped: int, arrival_ns: int) -> None:
@@ -510,6 +519,8 @@ class FlightLoop:
         timing = self._timing(state, step.skipped, step.arrival_ns, sent_ns)
         row = control_row(shown_s, step.phase, state, reference, error, step.out, timing)
         self._record.append(row)
+        if self._retuning is not None:
+            self._retuning.tick()
         finding = self._guards.check(state.q, error, self._last_state_s)
         if finding is not None:
             self._sequence.end(*finding, self._last_state_s)
@@ -523,9 +534,20 @@ class FlightLoop:
         to_go_s = max(0.0, course.duration_s - course.course_s(step.course_s))
         north, east, down = n[flat.B_HAT]
         return Progress(
-            *(step.phase.value, step.track_s, course.track_s, error_m, len(self._record), to_go_s),
-            *(n[flat.LYAPUNOV], (north, east, down), state.p, state.q, reference_m, n[flat.TOTAL], age_ms),
-            self._autopilot.battery,
+            phase=step.phase.value,
+            t_s=step.track_s,
+            duration_s=course.track_s,
+            error_m=error_m,
+            steps=len(self._record),
+            to_go_s=to_go_s,
+            lyapunov=n[flat.LYAPUNOV],
+            disturbance_m_s2=(north, east, down),
+            position_m=state.p,
+            attitude=state.q,
+            reference_m=reference_m,
+            thrust_n=n[flat.TOTAL],
+            state_age_ms=age_ms,
+            battery=self._autopilot.battery,
         )
 
     def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:

@@ -13,8 +13,9 @@ from companion.config import Flight, Vehicle
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S, Margins, Timing, margins
 from companion.errors import RefusedError
-from companion.flight.inspection import Problem, place_problems, reference_problems
+from companion.flight.inspection import reference_problems
 from companion.flight.phases import Autopilot, Cause, FlightEnded
+from companion.flight.surroundings import Problem, place_problems
 from companion.link import codec
 from companion.link.operations import Operation, Operations
 from companion.link.telemetry import VehicleState
@@ -119,7 +120,7 @@ def gate_reference(trajectory: Trajectory, vehicle: Vehicle) -> None:
 def gate_place(trajectory: Trajectory, height_min_m: float) -> None:
     """The trajectory stays above the ground and within the fence that came with it, where its anchor says where it is.
 
-    One that begins wherever the vehicle holds is looked at there (`inspection.gate_ground`).
+    One that begins wherever the vehicle holds is looked at there (`surroundings.gate_ground`).
 
     Raises:
         RefusedError: with the first figure that fails.

@@ -30,7 +30,7 @@ from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, write_summary
 from companion.record.recorder import Recorder
-from companion.record.summary import FlightMeta, summarise
+from companion.record.summary import FlightMeta, note_end, summarise
 from companion.record.ulog import Level
 from companion.trajectory.anchored import Trajectory
 from companion.trajectory.load import of_flight
@@ -207,16 +207,11 @@ def _finish(folder: Path, flight: Any, trajectory: Any, record: FlightRecord, ou
             flight.output.controller,
         )
         summary = summarise(record, outcome.phases, meta)
-        summary["ended"] = outcome.sentence
-        if outcome.engagement is not None:
-            summary["engagement"] = asdict(outcome.engagement)
-        summary["rejected_states"] = outcome.rejected_states
-        if flight.output.controller == "px4":
-            read = outcome.parameters
-            summary["px4_parameters"] = {name: read[name] for name in BASELINE_PARAMETERS if name in read}
-        if outcome.cause is not Cause.COMPLETED:
-            summary["verdict"] = f"ended early: {outcome.sentence}"
-        elif summary["verdict"] != "passed":
+        engagement = None if outcome.engagement is None else asdict(outcome.engagement)
+        read = outcome.parameters
+        px4_parameters = {name: read[name] for name in BASELINE_PARAMETERS if name in read}
+        note_end(summary, outcome.told(), engagement, px4_parameters)
+        if outcome.cause is Cause.COMPLETED and summary["verdict"] != "passed":
             code = int(ExitCode.MISSED)
         record.save(folder)
         write_summary(folder, summary)

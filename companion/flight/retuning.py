@@ -32,7 +32,8 @@ POINTS: Final = 10
 """Parts of the way; the certificate is computed at every point between them, and at the end."""
 WAITING_MAX: Final = 64
 """Changes that may wait for the one that is under way."""
-_YAW = (flat.RATES.stop - 1, flat.RATES_MODEL.stop - 1, flat.TAU.stop - 1)
+_UNLIMITED_RAD_S: Final = 1e6
+_YAW: Final = (flat.RATES.stop - 1, flat.RATES_MODEL.stop - 1, flat.TAU.stop - 1)
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,18 @@ def between(old: Parameters, new: Parameters, share: float) -> Parameters:
         return new
     keep = 1.0 - share
     a, b = old.gains, new.gains
-    mixed = [keep * x + share * y for x, y in zip(a, b, strict=True)]
-    gains = Gains(*mixed[:6], b.heading_kind, *mixed[7:])
+    gains = Gains(
+        keep * a.k1 + share * b.k1,
+        keep * a.k2 + share * b.k2,
+        keep * a.k3 + share * b.k3,
+        keep * a.k4 + share * b.k4,
+        keep * a.gamma + share * b.gamma,
+        keep * a.p_max + share * b.p_max,
+        b.heading_kind,
+        keep * a.l1 + share * b.l1,
+        keep * a.l2 + share * b.l2,
+        keep * a.damping + share * b.damping,
+    )
     c, d = old.limits, new.limits
     x, y, z = (keep * p + share * q for p, q in zip(c.rate_max, d.rate_max, strict=True))
     limits = Limits(
@@ -161,7 +172,9 @@ def points(old: Parameters, new: Parameters) -> list[Parameters]:
 class Turning:
     """Two engines that differ in the kind of heading; implements `tracker.Engine`.
 
-    Their other axes are the same numbers, since thrust, roll and pitch do not depend on the heading.
+    Their other axes are the same numbers, since thrust, roll and pitch do not depend on the heading. The new one wants
+    its direction from its first step on: what it asks of the yaw axis is bounded, and its share grows; a wanted
+    direction that is turned there at a limited rate would stop abruptly.
 
     Args:
         old: has flown so far.
@@ -174,6 +187,7 @@ class Turning:
         self.share = 0.0
         """Of the new engine in what goes out on the yaw axis."""
         self._old, self._kind = old, kind
+        self._first = True
 
     def begin(self, controller: ControllerState) -> None:
         """Takes a new controller state."""
@@ -187,7 +201,11 @@ class Turning:
 
     def retune(self, parameters: Parameters) -> None:
         """From now on with these parameters."""
-        self.new.retune(parameters)
+        limits = parameters.limits
+        if self._first:
+            limits = limits._replace(heading_rate_max=_UNLIMITED_RAD_S)
+            self._first = False
+        self.new.retune(parameters._replace(limits=limits))
         self._old.retune(parameters._replace(gains=parameters.gains._replace(heading_kind=self._kind)))
 
     def step(

@@ -14,10 +14,10 @@ from companion.config import Flight
 from companion.control.types import Vec3
 from companion.errors import RefusedError
 from companion.flight.course import Course
-from companion.flight.inspection import gate_ground
 from companion.flight.orders import Orders
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Order, Phase
 from companion.flight.preflight import Preflight
+from companion.flight.surroundings import gate_ground
 from companion.frames import yaw_from_quat
 from companion.link import modes
 from companion.link.modes import Mode

@@ -256,8 +256,8 @@ class Tracker:
         self._prediction = self._new_prediction(0.0)
         length = self._prediction.length_s or self._interval_s
         lags = factors((x, y, z, vehicle.rotors.lag_s), length)
-        self._build = lambda parameters: compiled.build(parameters, lags)
-        self._engine: Engine = self._build(self.parameters)
+        self._build: Callable[[Parameters], Engine] = lambda parameters: compiled.build(parameters, lags)
+        self._engine = self._build(self.parameters)
         self._transition: Transition | None = None
         self.transitions: list[Transition] = []
         """The ways to other parameters so far, the one under way among them."""
@@ -355,7 +355,7 @@ class Tracker:
             self._transition = None
 
     def _turn(self, kind: int, state: State) -> None:
-        """Another kind of heading begins where the nose points."""
+        """Another kind of heading begins; where it defines no direction it holds the one in which the nose points."""
         r1, r2, _ = axes(state.q)
         engine = self._build(self.parameters)
         engine.begin(self._engine.controller._replace(heading=HeadingState(r2, r1, False)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +70,7 @@ class Checks:
         if finding is None:
             return None
         self._running = None
-        return job, finding._replace(verdict=finding.verdict.replace(job.path.name, job.name))
+        return job, finding._replace(verdict=_renamed(finding.verdict, job))
 
     def close(self) -> None:
         """Stop what runs, forget what waits."""
@@ -78,3 +79,8 @@ class Checks:
         self._running = None
         self._uploads.clear()
         self._stored.clear()
+
+
+def _renamed(verdict: str, job: Job) -> str:
+    """The verdict with the name that people know, without the folder."""
+    return re.sub(r"(?:[^\s'\"]*/)?" + re.escape(job.path.name), lambda _: job.name, verdict)

@@ -20,16 +20,20 @@ from pathlib import Path
 from typing import Any, Final
 
 from companion.config import build_flight
-from companion.errors import CompanionError, ExitCode, LinkError
+from companion.errors import CompanionError, ExitCode, InputError, LinkError
 from companion.flight.connect import AUTOPILOT_COMPONENT, autopilot_system, send_heartbeat
 from companion.flight.loop import FlightLoop, Progress
 from companion.flight.phases import Autopilot, Cause, FlightEnded, Order, Phase
 from companion.flight.process import Status, warm_up
 from companion.flight.reports import take_heartbeat, take_report
+from companion.flight.retuning import ParameterChange
 from companion.flight.tracker import kernels
 from companion.ground.channel import Channel, Copy, Outgoing
 from companion.ground.filter import Gate
+from companion.ground.hosting import tuned, tuning_of, vehicle_of
 from companion.ground.messages import targets_of
+from companion.ground.parameter_messages import PARAM_REQUEST_LIST
+from companion.ground.parameters import WHAT as PARAMETERS
 from companion.ground.preparation import Closing, Preparation
 from companion.ground.report import Report
 from companion.ground.settings import Settings
@@ -71,7 +75,9 @@ class Control:
     """
 
     def __init__(self, settings: Settings, channel: Channel, report: Report) -> None:
-        self._settings = settings
+        self._settings = tuned(settings, tuning_of(settings).overrides)
+        self._vehicle = vehicle_of(settings)
+        """As its file has it, without what was changed from the ground."""
         self._channel = channel
         self._report = report
         self._gate = Gate()
@@ -128,7 +134,7 @@ class Control:
         hover = {"name": "hover", "shape": "hover", "duration_s": 1.0, "hover": {"point_m": [0.0, 0.0, 0.0]}}
         flight = build_flight({**self._settings.flight, "name": "hover", "trajectory": hover}, "companion serve")
         warm_up(flight, kernels(self._settings.engine))
-        codec.message_formats()
+        targets_of(codec.HEARTBEAT, b"")  # its table is made at the first call
 
     def _tap(self, direction: int, raw: bytes, wall_ns: int) -> None:
         recorder = self._recorder
@@ -244,11 +250,11 @@ class Control:
         well = outcome.cause in {Cause.COMPLETED, Cause.STOPPED}
         self._standing = replace(self._standing, phase=IDLE, paused=False, ended=outcome.sentence)
         self._flush_lines()
+        self._say(outcome.sentence, warning=not well)
         self._undertakings.check()
         self._undertakings.fail(outcome.sentence)
-        self._say(outcome.sentence, warning=not well)
         self._report.send(flight=str(ready.folder), outcome=outcome.sentence)
-        self._closing = Closing(ready, outcome, status)
+        self._closing = Closing(ready, outcome, status, report=self._settings.reports)
 
     def on_progress(self, progress: Progress) -> None:
         """How far the flight is."""
@@ -276,7 +282,10 @@ class Control:
                 return
         else:
             targets = targets_of(frame.msgid, frame.payload)
-            if targets is None or targets.component != COMPANION_COMPONENT:
+            if targets is None:
+                return
+            listed = frame.msgid == PARAM_REQUEST_LIST and targets.component == 0  # ground stations ask everybody
+            if targets.component != COMPANION_COMPONENT and not listed:
                 return
         self._channel.copy(frame.raw)
 
@@ -331,6 +340,8 @@ class Control:
             return
         if what == "start":
             refusal = self._start(number, note)
+        elif what == PARAMETERS:
+            refusal = self._retune(note)
         elif what in _ORDERS:
             refusal = self._order(number, _ORDERS[what])
         else:
@@ -360,6 +371,21 @@ class Control:
         self._say(f"start {name}: checking")
         self._preparation = Preparation(self._settings, name, Path(path), self._lines.append)
         return ""
+
+    def _retune(self, note: dict[str, Any]) -> str:
+        """Other gains, limits or another heading: a flight that is under way goes over to them, later ones begin so."""
+        if self._preparation is not None:
+            return "a flight is being prepared; try again in a moment"
+        try:
+            change = ParameterChange.from_note(note.get("change"))
+            if self._loop is None:
+                change.applied(self._vehicle)
+        except InputError as error:
+            return str(error)
+        refusal = "" if self._loop is None else self._loop.retune(change)
+        if not refusal:
+            self._settings = tuned(self._settings, change.overrides)
+        return refusal
 
     def _begun(self) -> bool:
         return self._loop is not None and self._loop.phase not in _NOT_YET_FLYING
@@ -409,6 +435,7 @@ class Control:
         self._on_end(number, operation.accepted, "" if operation.accepted else operation.sentence)
 
     def _on_end(self, number: int, done: bool, sentence: str) -> None:
+        self._tell_standing()  # first: who hears that it is done must not find things as they were
         self._channel.note(done=number, well=done, sentence=sentence)
 
     # -- telling people -------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ _QUEUE_SHARE, _QUEUE_S = 1.5, 0.03
 _TIMEOUT_MIN_S, _TIMEOUT_START_S, _TIMEOUT_MAX_S = 0.05, 0.5, 2.0
 _OVERTAKEN_BY = 3
 _LOOK_S = 0.1
+_GRAIN_S = 0.001  # a wait is rounded to milliseconds anyway; just too early would be a turn for nothing
 _ASK_AGAIN_S = 0.25
 
 
@@ -184,7 +185,7 @@ class Exchange:
     def _wait_s(self, pending: dict[int, _Sent]) -> float:
         """Until the first answer is overdue."""
         due_s = min((sent.at_s + self._pace.timeout_s(sent.sends) for sent in pending.values()), default=0.0)
-        return min(_LOOK_S, max(0.0, due_s - self._clock()))
+        return min(_LOOK_S, max(0.0, due_s - self._clock()) + _GRAIN_S)
 
     def _repeat(self, pending: dict[int, _Sent], newest: int) -> None:
         """Send again what is overdue, or was overtaken by the answers to several later ones."""

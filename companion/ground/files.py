@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Final
 
 from companion.ground.checks import Submission
@@ -45,7 +44,7 @@ from companion.link.framing import Frame
 from companion.link.wire import COMPANION_COMPONENT
 
 Say = Callable[[str, bool], None]
-"""Told when an upload has its verdict: a sentence for people, and whether the file was accepted."""
+"""Told when an upload has its verdict or is not taken: a sentence for people, and whether the file was accepted."""
 
 SESSION_IDLE_MAX_S: Final = 30.0
 UPLOAD_IDLE_MAX_S: Final = 3.0
@@ -268,6 +267,7 @@ class FileServer:
         try:
             submission = self._submit(client, session, (size, checksum) if given else None)
         except (StoreError, OSError) as error:
+            self._complain(f"{error}; not stored")
             reply = nak(request, errno_data(error.errno or errno.EIO))
             client.remember(request, reply, now_s)
             return reply
@@ -285,11 +285,13 @@ class FileServer:
         for session in list(client.sessions.values()):
             upload = session.upload
             fresh = now_s - session.last_s < RESET_COMPLETES_S
-            if upload is None or not fresh or upload.missing(None) is not None:
+            if upload is None or not fresh:
                 self._close(client, session)
                 continue
-            with suppress(StoreError):  # too many wait to be checked; this one can be ended again
+            try:
                 submissions.append(self._submit(client, session, None))
+            except (StoreError, OSError) as error:  # kept; it can be gone on with, or ended again
+                self._complain(f"{error}; not stored")
         client.forget(Opcode.TERMINATE_SESSION, Opcode.REMOVE_FILE, Opcode.RENAME)
         if not submissions:
             return ack(request)
@@ -323,6 +325,11 @@ class FileServer:
                 client.remember(request, reply, now_s)
             _send(client, reply)
         self._tell()
+
+    def _complain(self, sentence: str) -> None:
+        """Say what is wrong with an upload: some clients show no refusal at its end."""
+        if self._say is not None:
+            self._say(sentence, False)
 
     def _tell(self) -> None:
         """Say the verdicts that have come."""

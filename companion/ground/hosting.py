@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from zlib import crc32
 
 from companion import __version__
-from companion.config import build_flight
+from companion.config import Vehicle, build_flight, validate
 from companion.errors import InputError
 from companion.ground.examine import Apart
 from companion.ground.files import FileServer
+from companion.ground.parameter_file import file_for, load_tuning
+from companion.ground.parameters import ParameterServer, Requests
 from companion.ground.settings import Settings
 from companion.ground.store import TrajectoryStore
+from companion.ground.tuning import Tuning
 
 VERDICT: Final = "may be flown"
 
@@ -40,6 +44,34 @@ def judge(flight: dict[str, Any], path: Path) -> str:
     trajectory = load(path, vehicle=vehicle, confined=True)
     gate_reference(trajectory, vehicle)
     return f"{VERDICT}: {trajectory.duration_s:.1f} s"
+
+
+def vehicle_of(settings: Settings) -> Vehicle:
+    """The vehicle as the command line gave it."""
+    return validate(Vehicle, settings.flight["vehicle"], "companion serve: vehicle")
+
+
+def tuning_of(settings: Settings) -> Tuning:
+    """The vehicle with what was changed of it from the ground before.
+
+    Raises:
+        InputError: the file that keeps it cannot be used.
+    """
+    vehicle = vehicle_of(settings)
+    return load_tuning(file_for(Path(settings.trajectories), vehicle.name), vehicle)
+
+
+def tuned(settings: Settings, overrides: dict[str, Any]) -> Settings:
+    """The settings with other gains and limits: they override the vehicle's in every flight."""
+    return replace(settings, flight={**settings.flight, **overrides})
+
+
+def parameter_server(
+    settings: Settings, tuning: Tuning, requests: Requests, say: Callable[[str, bool], None], system: Callable[[], int]
+) -> ParameterServer:
+    """The service for gains, limits and heading."""
+    path = file_for(Path(settings.trajectories), tuning.base.name)
+    return ParameterServer(tuning, path, requests, say, system)
 
 
 def open_store(settings: Settings) -> TrajectoryStore:

@@ -73,8 +73,8 @@ class Preparation:
 class Closing:
     """The results of one flight on their way to the disk; the report is built by a process of its own."""
 
-    def __init__(self, ready: Ready, outcome: Outcome, status: Status) -> None:
-        self._ready, self._outcome, self._status = ready, outcome, status
+    def __init__(self, ready: Ready, outcome: Outcome, status: Status, *, report: bool) -> None:
+        self._ready, self._outcome, self._status, self._report = ready, outcome, status, report
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -90,7 +90,7 @@ class Closing:
     def _run(self) -> None:
         try:
             self._ready.close(self._status, self._outcome)
-            if self._outcome.engagement is not None:
+            if self._report and self._outcome.engagement is not None:
                 _build_report(self._ready.folder)
         except Exception as error:
             traceback.print_exc()

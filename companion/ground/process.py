@@ -18,7 +18,7 @@ from typing import Any, Final
 from companion.errors import CompanionError, ExitCode, LinkError
 from companion.ground.channel import Channel, Copy, Note
 from companion.ground.commands import CommandServer
-from companion.ground.hosting import Startable, file_server, open_store
+from companion.ground.hosting import Startable, file_server, open_store, parameter_server, tuned, tuning_of
 from companion.ground.links import GroundPort
 from companion.ground.messages import COMPANION_COMPONENT, Severity, targets_of
 from companion.ground.report import Report
@@ -68,10 +68,12 @@ class Ground:
         self._ports = [GroundPort(connection, self._system) for connection in settings.ground]
         self._vehicle = VehicleLink(channel)
         self._reports = Reports(self._ports, self._vehicle, lambda: self._standing)
-        store = open_store(settings)
+        tuning = tuning_of(settings)
+        store = open_store(tuned(settings, tuning.overrides))
         self._commands = CommandServer(self, Startable(store), self._reports, self._system)
         self._files = file_server(store, self._say_verdict)
-        self._services: list[Service] = [self._commands, self._files]
+        self._parameters = parameter_server(settings, tuning, self, self._say_verdict, self._system)
+        self._services: list[Service] = [self._commands, self._files, self._parameters]
         self._faults: set[str] = set()
         self._copies = FrameParser(message_formats(), LinkCounters())
         self._stopping = False
@@ -107,6 +109,7 @@ class Ground:
                 ticked_s = now_s
                 self._tick(now_s)
         self._files.close()
+        self._parameters.close()
         for port in self._ports:
             port.close()
         return int(ExitCode.DONE)
@@ -157,7 +160,9 @@ class Ground:
             severity = Severity.WARNING if note.get("warning") else Severity.INFO
             self._reports.say(severity, str(note["line"]))
         elif "taken" in note:
-            self._commands.on_taken(int(note["taken"]), str(note.get("refusal", "")), now_s)
+            number, refusal = int(note["taken"]), str(note.get("refusal", ""))
+            if not self._parameters.on_taken(number, refusal, now_s):
+                self._commands.on_taken(number, refusal, now_s)
         elif "done" in note:
             sentence = str(note.get("sentence", ""))
             self._commands.on_done(int(note["done"]), bool(note.get("well")), sentence, now_s)

@@ -21,6 +21,8 @@ class Settings:
     """Folder that gets a folder per flight."""
     engine: str
     """"auto", "python" or "numba"."""
+    reports: bool = True
+    """Whether a flight's report.html is built when the flight is over."""
     flight: dict[str, Any] = field(default_factory=dict)
     """Contents of a flight file but for name and trajectory: the vehicle as a table, output, take-off height, ..."""
 

@@ -154,11 +154,15 @@ class Upload:
         begin, stop = self._last_block
         short = stop - begin < self._block_max
         if not short and not os.pread(self._fd, 1, end - 1).endswith(_TEXT_ENDS):
-            return "it may be cut off: it ends with a full block, and not with the end of a line"
+            return "it may be cut off, as it ends with a full block and without a line end (add one)"
         return None
 
-    def close(self) -> None:
-        """Close the hidden file, cut to what can be gone on with; remove it when that is nothing."""
+    def close(self, *, whole: bool = False) -> None:
+        """Close the hidden file, cut to what can be gone on with; remove it when that is nothing.
+
+        Args:
+            whole: nothing is missing; then even an empty file stays.
+        """
         if self._fd < 0:
             return
         there = self._ranges.prefix
@@ -168,7 +172,7 @@ class Upload:
         finally:
             os.close(self._fd)
             self._fd = -1
-        if there == 0:
+        if there == 0 and not whole:
             self.path.unlink(missing_ok=True)
 
     def _contradicts(self, offset: int, data: bytes) -> bool:

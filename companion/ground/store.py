@@ -243,7 +243,7 @@ class TrajectoryStore:
         submission = Submission(upload.name, upload.received, upload.crc32)
         self._serial += 1
         checked = self.folder / f"{_CHECK}{self._serial}-{upload.name}"
-        upload.close()
+        upload.close(whole=True)
         os.rename(upload.path, checked)
         self._recent.append(submission)
         self._checks.add(Job(checked, upload.name, submission))

@@ -147,7 +147,8 @@ class Files:
             LinkError: no answer.
         """
         try:
-            self._exchange.ask(Opcode.REMOVE_FILE, _checked(name).encode())
+            # the session means nothing here, but tells this wish from the same one a moment ago
+            self._exchange.ask(Opcode.REMOVE_FILE, _checked(name).encode(), session=self._next_session())
         except NakError as nak:
             raise _explained(nak, name) from None
 

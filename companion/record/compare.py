@@ -9,9 +9,10 @@ from typing import Any, Final, NamedTuple
 
 from companion.errors import InputError
 from companion.record.figures import FIGURES
-from companion.record.folder import read_summary, write_whole
+from companion.record.flight_source import FlightSource, read_source_summary
+from companion.record.folder import write_whole
 from companion.record.page import compose
-from companion.record.report import flight_name, read_flight, section
+from companion.record.report import flight_name, notes, read_flight, section
 from companion.record.summary import PASSED
 
 COMPARE_FILE: Final = "compare.html"
@@ -50,16 +51,16 @@ def value_of(summary: Mapping[str, Any], measure: Measure) -> float | None:
     return float(found) * measure.scale if isinstance(found, int | float) else None
 
 
-def table(folders: Sequence[Path]) -> list[dict[str, Any]]:
-    """One entry per flight: folder, trajectory, vehicle, controller, verdict and every measure by its title.
+def table(flights: Sequence[Path | FlightSource]) -> list[dict[str, Any]]:
+    """One entry per flight: folder (or log), trajectory, vehicle, controller, verdict and every measure by its title.
 
     Raises:
-        InputError: a folder holds no summary.
+        InputError: one holds no flight.
     """
     rows = []
-    for folder in folders:
-        summary = read_summary(folder)
-        row: dict[str, Any] = {"folder": str(folder)}
+    for flight in flights:
+        summary = read_source_summary(flight) if isinstance(flight, Path) else flight.summary
+        row: dict[str, Any] = {"folder": str(flight if isinstance(flight, Path) else flight.path)}
         row |= {key: summary.get(key, "?") for key in ("trajectory", "vehicle", "verdict")}
         row["controller"] = summary.get("controller", "law")
         row |= {_heading(measure): value_of(summary, measure) for measure in MEASURES}
@@ -108,12 +109,19 @@ def build_comparison(first: Path, second: Path, out: Path | None = None) -> Path
         "SUBTITLE": "two flights side by side; time zooms in all figures together",
         "VERDICT": " · ".join(html.escape(str(flight.summary.get("verdict", "unknown"))) for flight, _ in flights),
         "VERDICT_CLASS": "passed" if all(passed) else "missed",
-        "THRESHOLDS": _measures(names, [flight.summary for flight, _ in flights]),
+        "THRESHOLDS": notes(
+            [
+                f"{name}: {sentence}"
+                for name, (flight, _) in zip(names, flights, strict=True)
+                for sentence in flight.missing
+            ]
+        )
+        + _measures(names, [flight.summary for flight, _ in flights]),
         "TILES": "",
         "FIGURES": "".join(sections),
         "TABLES": "",
     }
-    path = out or first / COMPARE_FILE
+    path = out or (first if first.is_dir() else first.parent) / COMPARE_FILE
     try:
         return write_whole(path, compose(parts, drawn))
     except OSError as error:

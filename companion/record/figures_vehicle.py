@@ -39,10 +39,10 @@ def events(flight: FlightData) -> dict[str, Any]:
     data: list[dict[str, Any]] = []
     for index, phase in enumerate(flight.phases):
         data.append(
-            _bar("phase", [(phase.from_s, phase.to_s)], _BAND_COLOURS[index % 2], f"{phase.name}: {phase.reason}")
+            bar("phase", [(phase.from_s, phase.to_s)], _BAND_COLOURS[index % 2], f"{phase.name}: {phase.reason}")
         )
         data[-1] |= {"text": [phase.name], "textposition": "inside", "insidetextanchor": "middle"}
-    data += [_bar(text, spells, _ALARM, text) for text, spells in bands]
+    data += [bar(text, spells, _ALARM, text) for text, spells in bands]
     layout = _layout(flight, [""])
     layout |= {"barmode": "overlay", "showlegend": False, "hovermode": "closest", "bargap": 0.35}
     names = [text for text, _ in reversed(bands)] + ["phase"]
@@ -62,7 +62,7 @@ def _spells(time_s: Array, active: npt.NDArray[np.bool_]) -> list[tuple[float, f
     return [(float(time_s[rows[a]]), float(time_s[rows[b]]) + step_s) for a, b in zip(firsts, lasts, strict=True)]
 
 
-def _bar(row: str, spells: Sequence[tuple[float, float]], colour: str, hover: str) -> dict[str, Any]:
+def bar(row: str, spells: Sequence[tuple[float, float]], colour: str, hover: str) -> dict[str, Any]:
     """Spells of one row, drawn as horizontal bars."""
     return {
         **{"type": "bar", "orientation": "h", "y": [row] * len(spells), "name": row},
@@ -71,7 +71,7 @@ def _bar(row: str, spells: Sequence[tuple[float, float]], colour: str, hover: st
     }
 
 
-def _turned(q: Array) -> Array:
+def turned(q: Array) -> Array:
     """Roll, pitch and heading [rad], shape (len, 3), of quaternions, shape (len, 4)."""
     w, x, y, z = q.T
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
@@ -83,7 +83,7 @@ def _turned(q: Array) -> Array:
 def attitude(flight: FlightData) -> dict[str, Any]:
     """Roll and pitch, and the tilt, in degrees."""
     q = flight.record.columns("q_w", "q_x", "q_y", "q_z")
-    degrees = np.degrees(_turned(q))
+    degrees = np.degrees(turned(q))
     tilt = np.degrees(np.arccos(np.clip(1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2), -1.0, 1.0)))
     layout = _layout(flight, ["Angle [deg]", "Tilt [deg]"])
     data = lines(flight.time_s, degrees[:, :2], ["roll", "pitch"], AXES[:2])
@@ -118,7 +118,7 @@ def _command(share: Array, curve: float) -> Array:
 def heading(flight: FlightData) -> dict[str, Any]:
     """The heading, the path's direction while there is one, and the heading error, in degrees."""
     record = flight.record
-    yaw = np.degrees(_turned(record.columns("q_w", "q_x", "q_y", "q_z"))[:, 2])
+    yaw = np.degrees(turned(record.columns("q_w", "q_x", "q_y", "q_z"))[:, 2])
     north, east = record.column("ref_v_n"), record.column("ref_v_e")
     course = np.where(np.hypot(north, east) > _SLOW_M_S, np.degrees(np.arctan2(east, north)), math.nan)
     layout = _layout(flight, ["Heading [deg]", "Error [deg]"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,6 +28,8 @@ class FlightData:
     """All rotors at full command; None: unknown."""
     curve_factor: float = 0.0
     """Of the thrust curve: thrust = full (factor u^2 + (1 - factor) u)."""
+    missing: Sequence[str] = ()
+    """What could not be read, a sentence each."""
 
     @property
     def start_s(self) -> float:

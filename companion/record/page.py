@@ -57,6 +57,8 @@ h3 { font-size: 15px; margin: 0 0 6px; }
 .verdict.missed { background: var(--bad); border-radius: 14px; }
 .thresholds { margin: 14px 0; }
 .thresholds p { margin: 0; color: var(--soft); }
+.missing { margin: 0 0 12px; padding: 10px 14px; border: 1px solid #f0c36d; border-radius: 10px; background: #fff8e6; }
+.missing ul { margin: 4px 0 0; padding-left: 20px; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(168px, 1fr)); gap: 10px; margin: 14px 0; }
 .tile, .figure, .listing { background: white; border: 1px solid var(--line); border-radius: 10px; }
 .tile { padding: 9px 12px; display: flex; flex-direction: column; }

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import html
 import math
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -13,94 +11,68 @@ from typing import Any, Final
 import numpy as np
 
 from companion.errors import InputError
-from companion.record.charts import Array
 from companion.record.columns import LIMIT_NAMES, TRACK_PHASE
 from companion.record.figures import FIGURES
 from companion.record.flight_data import FlightData
 from companion.record.flight_record import FlightRecord
-from companion.record.folder import CONFIGURATION_FILE, read_summary, write_whole
+from companion.record.flight_source import FlightSource, read_source
+from companion.record.folder import write_whole
 from companion.record.page import compose
 from companion.record.summary import PASSED
 
 REPORT_FILE: Final = "report.html"
 _ROTORS: Final = 4
-TRUTH_FILE: Final = "truth.csv"
-"""Written by the simulated vehicle: what really happened, on the clock of the record's `t_s`."""
 
 
-def build_report(folder: Path, out: Path | None = None) -> Path:
-    """Write `report.html` (or `out`) from what is in a flight's folder and return its path.
+def build_report(flown: FlightSource | Path, out: Path | None = None) -> Path:
+    """Write `report.html` (or `out`) of a flight and return its path; a log's page stands beside it, under its name.
 
-    Needs `record.npz` and `summary.json`; uses `flight.toml` (thresholds, limits, gains, mass) and `truth.csv` when
-    they are there.
+    Args:
+        flown: the flight, or its folder or log. Of a folder `record.npz` and `summary.json` are read, or `flight.ulg`
+            where they are missing; `flight.toml` (thresholds, limits, gains, mass) and `truth.csv` when they are there.
+        out: the page.
 
     Raises:
         InputError: a file is missing that must be there, or one cannot be read, or the report cannot be written.
     """
-    flight, configuration = read_flight(folder)
-    page = _page(flight_name(configuration, folder), flight, configuration)
-    path = out or folder / REPORT_FILE
+    flight, configuration = read_flight(flown)
+    source = flown if isinstance(flown, Path) else flown.path
+    page = _page(flight_name(configuration, source), flight, configuration)
+    path = out or (source / REPORT_FILE if source.is_dir() else source.with_suffix(".html"))
     try:
         return write_whole(path, page)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); name another with --out") from None
 
 
-def read_flight(folder: Path) -> tuple[FlightData, dict[str, Any]]:
-    """What a flight's folder holds, and its configuration. Raises InputError."""
-    record = FlightRecord.load(folder)
-    summary = read_summary(folder)
-    configuration = _read_configuration(folder / CONFIGURATION_FILE)
+def read_flight(flown: FlightSource | Path) -> tuple[FlightData, dict[str, Any]]:
+    """What a flight's folder or log holds, and its configuration. Raises InputError."""
+    read = read_source(flown) if isinstance(flown, Path) else flown
+    configuration = read.configuration
     mass_kg = next((value for value in _find(configuration, "mass_kg") if isinstance(value, int | float)), None)
     flight = FlightData(
-        record=record,
-        summary=summary,
-        truth=_read_truth(folder / TRUTH_FILE),
+        record=read.record,
+        summary=read.summary,
+        truth=read.truth,
         mass_kg=None if mass_kg is None else float(mass_kg),
         limits=_merged(configuration, "limits"),
         thrust_full_n=_rotors(configuration)[0],
         curve_factor=_rotors(configuration)[1],
+        missing=read.missing,
     )
     return flight, configuration
 
 
-def flight_name(configuration: Mapping[str, Any], folder: Path) -> str:
-    """What the flight file calls the flight, or the name of its folder."""
+def flight_name(configuration: Mapping[str, Any], source: Path) -> str:
+    """What the flight file calls the flight, or the name of its folder or log."""
     flight = configuration.get("flight")
     for table in (configuration, flight if isinstance(flight, Mapping) else {}):
         if isinstance(name := table.get("name"), str) and name:
             return name
-    return folder.resolve().name
+    return source.resolve().name
 
 
-# --- reading ---------------------------------------------------------------------------------------------------------
-
-
-def _read_configuration(path: Path) -> dict[str, Any]:
-    """The configuration as used; empty when there is none."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); repair or remove it") from None
-
-
-def _read_truth(path: Path) -> dict[str, Array]:
-    """The truth by column; empty when there is none. A last line that was cut off is left out."""
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file)
-            names = next(reader, [])
-            rows = [[float(value) for value in row] for row in reader if len(row) == len(names) and row[-1]]
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); repair or remove it") from None
-    if "t_s" not in names:
-        raise InputError(f"{path}: the first line must name the columns, t_s among them; repair or remove it")
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
-    return {name: table[:, index] for index, name in enumerate(names)}
+# --- the configuration -----------------------------------------------------------------------------------------------
 
 
 def _find(configuration: Mapping[str, Any], key: str) -> Iterator[Any]:
@@ -139,7 +111,7 @@ def _page(name: str, flight: FlightData, configuration: Mapping[str, Any]) -> st
         "SUBTITLE": _subtitle(flight.summary),
         "VERDICT": html.escape(verdict),
         "VERDICT_CLASS": "passed" if verdict == PASSED else "missed",
-        "THRESHOLDS": _thresholds(flight.summary, _merged(configuration, "acceptance")),
+        "THRESHOLDS": notes(flight.missing) + _thresholds(flight.summary, _merged(configuration, "acceptance")),
         "TILES": _tiles(flight.summary),
         "FIGURES": sections,
         "TABLES": _tables(flight, configuration),
@@ -172,6 +144,14 @@ def section(title: str, caption: str, keys: Sequence[str], height_px: int) -> st
     )
 
 
+def notes(missing: Sequence[str]) -> str:
+    """What could not be read; nothing when all was."""
+    if not missing:
+        return ""
+    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in missing)
+    return f'<div class="missing"><b>Not everything could be read.</b><ul>{items}</ul></div>'
+
+
 def _by_law(summary: Mapping[str, Any]) -> bool:
     """Whether the law flew; else there are no numbers of it."""
     return bool(summary.get("controller", "law") == "law")
@@ -196,6 +176,8 @@ def _thresholds(summary: Mapping[str, Any], acceptance: Mapping[str, Any]) -> st
         return "<p>The flight file sets no thresholds.</p>"
     rows = []
     for key, most in acceptance.items():
+        if not isinstance(most, int | float):
+            continue
         value = summary.get(key)
         good = isinstance(value, int | float) and value <= most
         cells = f"<td>{html.escape(key)}</td><td>{_number(value)}</td><td>{_number(most)}</td>"
@@ -238,10 +220,11 @@ def _tiles(summary: Mapping[str, Any]) -> str:
     ]
     if not _by_law(summary):
         tiles = [tile for tile in tiles if tile[0] not in {"Disturbance", "Thrust"}]
-    return "".join(_tile(*map(html.escape, tile)) for tile in tiles)
+    return "".join(tile(*map(html.escape, tile)) for tile in tiles)
 
 
-def _tile(label: str, value: str, note: str) -> str:
+def tile(label: str, value: str, note: str) -> str:
+    """A figure with what it is, as HTML; the arguments are HTML."""
     return f'<div class="tile"><span>{label}</span><b>{value}</b><small>{note}</small></div>'
 
 
@@ -252,14 +235,14 @@ def _tables(flight: FlightData, configuration: Mapping[str, Any]) -> str:
         for entry in flight.summary.get("phases", [])
     ]
     reached = [(LIMIT_NAMES[bit], share) for bit, share in _limit_shares(flight.record)]
-    tables = [_listing("Phases", ("phase", "from, s", "because"), phases)]
+    tables = [listing("Phases", ("phase", "from, s", "because"), phases)]
     if _by_law(flight.summary):
-        gains = _listing("Gains used", ("gain", "value"), _settings(_merged(configuration, "controller")))
-        tables.append(_listing("Limits reached on the track", ("limit", "share of the steps"), reached, empty="None."))
+        gains = listing("Gains used", ("gain", "value"), _settings(_merged(configuration, "controller")))
+        tables.append(listing("Limits reached on the track", ("limit", "share of the steps"), reached, empty="None."))
     else:
         read = flight.summary.get("px4_parameters", {})
-        gains = _listing("Parameters of PX4's controller", ("parameter", "value"), _settings(read))
-    return "".join((*tables, _listing("Limits used", ("limit", "value"), _settings(flight.limits)), gains))
+        gains = listing("Parameters of PX4's controller", ("parameter", "value"), _settings(read))
+    return "".join((*tables, listing("Limits used", ("limit", "value"), _settings(flight.limits)), gains))
 
 
 def _limit_shares(record: FlightRecord) -> list[tuple[int, str]]:
@@ -280,7 +263,7 @@ def _setting(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _listing(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], empty: str = "") -> str:
+def listing(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], empty: str = "") -> str:
     """A titled table; nothing at all when it has no rows and nothing to say about that."""
     if not rows and not empty:
         return ""

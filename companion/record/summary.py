@@ -47,6 +47,8 @@ ACCEPTANCE_KEYS: Final = (
 PASSED: Final = "passed"
 NOT_SETTLED: Final = "not settled"
 DID_NOT_TRACK: Final = "did not track"
+COMPLETED: Final = "COMPLETED"
+"""The cause of an end as planned."""
 
 
 class PhaseChange(NamedTuple):
@@ -119,6 +121,30 @@ def summarise(record: FlightRecord, phases: Sequence[PhaseChange], meta: FlightM
     }
     summary["verdict"] = _verdict(summary, meta.acceptance)
     return summary
+
+
+def note_end(
+    summary: dict[str, Any],
+    outcome: Mapping[str, Any],
+    engagement: Mapping[str, Any] | None,
+    px4_parameters: Mapping[str, float],
+) -> None:
+    """Add how the flight ended.
+
+    Args:
+        summary: of `summarise`; changed.
+        outcome: "sentence", "cause" and "rejected_states", as the flight's log keeps them.
+        engagement: how the controller took over, if it did.
+        px4_parameters: those of PX4's own controller, for a flight of its.
+    """
+    summary["ended"] = outcome["sentence"]
+    if engagement is not None:
+        summary["engagement"] = engagement
+    summary["rejected_states"] = outcome["rejected_states"]
+    if summary["controller"] == "px4":
+        summary["px4_parameters"] = px4_parameters
+    if outcome["cause"] != COMPLETED:
+        summary["verdict"] = f"ended early: {outcome['sentence']}"
 
 
 def without_wall_clock(summary: Mapping[str, Any]) -> dict[str, Any]:

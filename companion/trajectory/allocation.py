@@ -55,10 +55,18 @@ SPREAD = (1.0, 0.8, 0.45, 0.2)
 STRETCHES = 40
 STRETCH_GAIN = 0.8
 STRETCH_MAX = 0.15
+"""At a time: the heading along a path follows no simple law."""
+
 STRETCH_ENOUGH = 2e-3
+"""Excess that is left to scaling."""
+
 STRETCH_MARGIN = 1e-3
-SCALINGS = 8
+"""Aimed at below the limits where scaling cannot follow."""
+
+SCALINGS = 30
 SCALE_ENOUGH = 2e-4
+"""Excess below the limits that is not worth another round."""
+
 ROUNDING = 1e-7
 """Left below the limits, for rounding."""
 
@@ -285,7 +293,7 @@ def _scaled(durations_s: Array, exceeded: Callable[[Array], Array], knots: Knots
             kept = durations_s
             if by_part.min() > -SCALE_ENOUGH:
                 break
-        # The excess falls at least as fast as durations grow, and at most about four times as fast.
+        # What is above -1 falls at least as fast as durations grow, and at most about four times as fast.
         factors = 1.0 + np.where(by_part > 0.0, by_part * (1.0 + 1e-3), 0.25 * by_part)
         durations_s = durations_s * np.repeat(factors, counts)
     return durations_s if kept is None else kept

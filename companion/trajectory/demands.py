@@ -15,12 +15,16 @@ from companion.trajectory.torque import Body
 
 Array = NDArray[np.float64]
 
+UNLIMITED = 1e9
+"""What stands for a limit that is infinite."""
+
 TINY = 1e-12
 """Keeps divisions by lengths of zero vectors defined."""
 
 
 class Excess(NamedTuple):
-    """How far instants are beyond the limits: each share above zero is a violation, of about that share of the limit.
+    """How far instants are beyond the limits, as a share of what a vehicle at rest has left of them: -1 at rest, above
+    zero a violation. Durations that grow by a share take at least about that share off what is above -1.
 
     The first six are those of `flatness.BOUNDS`; all have the shape of one component.
     """
@@ -74,6 +78,16 @@ class Gauge:
     disturbance_m_s2: float = 0.0
     body: Body | None = None
 
+    def left_at_rest(self) -> dict[str, float]:
+        """Return what a vehicle at rest has left of the limits that bear on rest [m/s^2]; what is not above zero leaves
+        no way to fly."""
+        g, mass, room = self.model.gravity_m_s2, self.model.mass_kg, self.disturbance_m_s2
+        return {
+            "tilt": g * sin(self.limits.tilt_max_rad) - room,
+            "least thrust": g - room - self.limits.thrust_min_n / mass,
+            "thrust": min(self.limits.thrust_max_n / mass, UNLIMITED) - g - room,
+        }
+
     def excess(self, v: Array, a: Array, j: Array) -> tuple[Excess, Parts]:
         """Return the excess of instants with these derivatives, each of shape (3, ...) in NED."""
         lim, model, room = self.limits, self.model, self.disturbance_m_s2
@@ -86,14 +100,15 @@ class Gauge:
         along = _dot(r, f1)
         across = f1 - along * r
         speed, acceleration, turn = _length(v), _length(a), _length(across)
-        s, c, w = sin(lim.tilt_max_rad), cos(lim.tilt_max_rad), lim.rate_max_rad_s
+        s, c, w = sin(lim.tilt_max_rad), cos(lim.tilt_max_rad), min(lim.rate_max_rad_s, UNLIMITED)
+        tilt, low, high = self.left_at_rest().values()
         excess = Excess(
             speed / lim.speed_max_m_s - 1.0,
             acceleration / lim.acceleration_max_m_s2 - 1.0,
-            (level * c - f[2] * s + room) / (g * s),
-            (lim.thrust_min_n / model.mass_kg + room - n) / g,
-            (n + room - lim.thrust_max_n / model.mass_kg) / g,
-            (turn - w * (n - room)) / (w * g),
+            (level * c - f[2] * s + room) / tilt,
+            (g - n) / low - 1.0,
+            (n - g) / high - 1.0,
+            (turn - w * (n - room)) / (w * (g - room)),
         )
         return excess, Parts(v, a, speed, acceleration, f, level, r, along, across, turn)
 
@@ -116,14 +131,16 @@ class Gauge:
     def gradient(self, parts: Parts, weights: Excess) -> tuple[Array, Array, Array]:
         """Return the gradient over v, a and j of the sum of weights times excess."""
         lim, g, d = self.limits, self.model.gravity_m_s2, self.model.drag_1_s
-        s, c, w = sin(lim.tilt_max_rad), cos(lim.tilt_max_rad), lim.rate_max_rad_s
+        s, c, w = sin(lim.tilt_max_rad), cos(lim.tilt_max_rad), min(lim.rate_max_rad_s, UNLIMITED)
+        tilt, low, high = self.left_at_rest().values()
+        rate = g - self.disturbance_m_s2
         unit = parts.across / (parts.turn + TINY)
-        over_f1 = (weights.rate / (w * g)) * unit
+        over_f1 = (weights.rate / (w * rate)) * unit
         n = _dot(parts.f, parts.r)
-        over_f = ((weights.thrust_high - weights.thrust_low - weights.rate) / g) * parts.r
+        over_f = (weights.thrust_high / high - weights.thrust_low / low - weights.rate / rate) * parts.r
         over_f -= (parts.along / (n + TINY)) * over_f1
-        over_f[2] -= weights.tilt / g
-        over_f[:2] += (weights.tilt * (c / (g * s)) / (parts.level + TINY)) * parts.f[:2]
+        over_f[2] -= weights.tilt * (s / tilt)
+        over_f[:2] += (weights.tilt * (c / tilt) / (parts.level + TINY)) * parts.f[:2]
         over_v = (weights.speed / (lim.speed_max_m_s * (parts.speed + TINY))) * parts.v - d * over_f
         over_a = (weights.acceleration / (lim.acceleration_max_m_s2 * (parts.acceleration + TINY))) * parts.a
         return over_v, over_a - over_f - d * over_f1, -over_f1

@@ -181,13 +181,11 @@ def _direction(points: Array, i: int) -> Array:
 
 def _hovers(gauge: Gauge, limits: PlanLimits) -> None:
     """Refuse limits that do not even let the vehicle rest."""
-    rest = np.zeros((3, 1))
-    excess = gauge.excess(rest, rest, rest)[0]
-    beyond = [name for name, value in excess._asdict().items() if value.max() > 0.0]
+    beyond = [name for name, left in gauge.left_at_rest().items() if left <= 0.0]
     if beyond:
         raise RefusedError(
             f"no path keeps the limits: resting in a wind of {limits.wind_m_s:g} m/s alone exceeds that of"
-            f" {' and '.join(name.replace('_', ' ') for name in beyond)}; lower limits.wind_m_s"
+            f" {' and '.join(beyond)}; lower limits.wind_m_s"
         )
 
 

@@ -24,8 +24,8 @@ START += "sys.argv[0] = str(path); runpy.run_path(str(path), run_name='__main__'
 class Console:
     """MAVProxy's console: commands in, lines out."""
 
-    def __init__(self, port, folder):
-        options = ["--master", f"udpin:127.0.0.1:{port}", "--state-basedir", str(folder)]
+    def __init__(self, master, folder, *more):
+        options = ["--master", master, "--state-basedir", str(folder), *more]
         self.process = subprocess.Popen(
             [sys.executable, "-u", "-c", START, *options, "--logfile", str(folder / "mav.tlog")],
             stdin=subprocess.PIPE,
@@ -75,7 +75,7 @@ def test_parameters_modes_arming_and_waypoints(tmp_path):
     plan = tmp_path / "plan.txt"
     plan.write_text(PLAN)
     with vehicle("--param", "COM_DISARM_PRFLT=-1", speed=2.0) as ready:
-        console = Console(ready["ground_remote_port"], tmp_path)
+        console = Console(f"udpin:127.0.0.1:{ready['ground_remote_port']}", tmp_path)
         try:
             console.wait("Detected vehicle 1:1", "Mode LOITER", "parameters to")
             console.do("param fetch", "Requested parameter list", "parameters to")

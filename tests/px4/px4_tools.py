@@ -178,9 +178,9 @@ class Link:
 
 
 class Flight:
-    """A PX4 in our world, and the link to it."""
+    """A PX4 in our world, and the link to it, if wanted: else somebody else has its port."""
 
-    def __init__(self, options: HilOptions, folder: Path) -> None:
+    def __init__(self, options: HilOptions, folder: Path, link: bool = True) -> None:
         self.instance = free_instance()
         binary()
         self.said: list[str] = []
@@ -189,7 +189,7 @@ class Flight:
         self.hil = Hil(options, HilServer(4560 + self.instance), stopped=lambda: self._stop, notice=self.said.append)
         self.thread = threading.Thread(target=lambda: self.results.append(self.hil.run()))
         self.thread.start()
-        self.link = Link(self.instance)
+        self._link = Link(self.instance) if link else None
         self.px4 = Px4("none_iris", self.instance, folder, PX4_SIM_SPEED_FACTOR=f"{options.speed:g}")
 
     def close(self) -> None:
@@ -197,8 +197,14 @@ class Flight:
         self._stop = True
         self.thread.join(10.0)
         self.hil.close()
-        self.link.close()
+        if self._link is not None:
+            self._link.close()
         assert not self.thread.is_alive()
+
+    @property
+    def link(self) -> Link:
+        assert self._link is not None
+        return self._link
 
     @property
     def truth(self):
@@ -220,8 +226,8 @@ class Flight:
 
 
 @contextlib.contextmanager
-def flying(options: HilOptions, folder: Path) -> Iterator[Flight]:
-    flight = Flight(options, folder)
+def flying(options: HilOptions, folder: Path, link: bool = True) -> Iterator[Flight]:
+    flight = Flight(options, folder, link)
     try:
         yield flight
     finally:

@@ -17,7 +17,8 @@ from companion.cli.sketch import sketch
 from companion.config import load_vehicle
 from companion.control.types import Reference
 from companion.errors import RefusedError
-from companion.flight.inspection import inspect, separation
+from companion.flight.inspection import inspect
+from companion.flight.surroundings import separation
 from companion.trajectory import torque
 from companion.trajectory.anchored import Trajectory, anchored
 from companion.trajectory.flatness import PointMass
@@ -29,13 +30,9 @@ ZERO = (0.0, 0.0, 0.0)
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A prediction of one second instead of fifteen: what it finds has its own tests."""
-    gate = predict.gate_prediction
-    monkeypatch.setattr(predict, "PREDICTED_S", 1.0)
-    monkeypatch.setattr(
-        predict, "predict", lambda flight, trajectory, compiled, _=predict.predict: _(flight, trajectory, compiled, 1.0)
-    )
-    assert predict.gate_prediction is gate
+    """No simulated flight: that takes most of the time, and has its own tests."""
+    figures = predict.Prediction(*(predict.Extreme(1.0, 0.5) for _ in range(6)), 0.0, 0.0)
+    monkeypatch.setattr(predict, "gate_prediction", lambda *_: figures)
 
 
 def document(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> dict[str, Any]:
@@ -114,7 +111,7 @@ def written(folder: Path, name: str, text: str) -> str:
 def test_a_jump_in_the_fourth_derivative_at_joints_is_reported_and_let_pass(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = written(tmp_path, "eight.csv", polynomial(EIGHT.at, 62.0, 31))
+    path = written(tmp_path, "eight.csv", polynomial(EIGHT.at, 62.0, 31, digits=12))
     found = document(capsys, path, "--vehicle", "paper")["files"][0]
     fourth = found["fourth_derivative"]
     assert 25 <= fourth["jumps"] <= 30
@@ -234,7 +231,7 @@ def test_the_table_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     text = "\n".join(lines)
     for part in (
         "301 samples at 10 Hz became a spline of degree 9",
-        "  speed                    1.41 m/s",
+        "  speed                      1.41 m/s",
         "predicted, first 15 s",
         "fourth derivative: continuous",
         "start: 1 m/s",
@@ -246,6 +243,7 @@ def test_the_table_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     assert max(map(len, lines)) < 160
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_refusal_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "circle", "--vehicle", "bundled", "--time-scale", "4"]) == 3
     out = capsys.readouterr().out
@@ -290,7 +288,8 @@ def test_bad_input(capsys: pytest.CaptureFixture[str], arguments: list[str], par
 @pytest.mark.usefixtures("quick")
 def test_json_stands_alone_even_when_a_figure_is_infinite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Free fall has no thrust direction: rates are infinite, which JSON does not know.
-    text = 'shape = "lissajous"\nduration_s = 10\n[lissajous]\namplitude_m = [0, 0, 9.81]\nangular_rate_rad_s = [0, 0, 1]\n'
+    text = 'shape = "lissajous"\nduration_s = 10\n[lissajous]\namplitude_m = [0, 0, 9.81]\n'
+    text += "angular_rate_rad_s = [0, 0, 1]\n"
     found = document(capsys, written(tmp_path, "fall.toml", text), "--vehicle", "bundled", code=3)
     assert found["files"][0]["problems"]
 

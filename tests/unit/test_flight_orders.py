@@ -79,8 +79,8 @@ def test_stop_ends_in_hold() -> None:
     script.be(modes.HOLD)
     ended = script.ends()
     assert (ended.cause, ended.cause.value.exit_code) == (Cause.STOPPED, 0)
-    assert give(script, Order.STOP) == ""
-    assert give(script, Order.LAND) == "the flight is ending"
+    assert script.sequence.orders.give(Order.STOP) == ""
+    assert script.sequence.orders.give(Order.LAND) == "the flight is ending"
 
 
 def test_land_out_of_a_pause() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import asdict, replace
@@ -92,7 +93,7 @@ def test_a_fast_course_takes_longer_to_stop() -> None:
         course.change_pace(ramp)
         speeds = [math.hypot(*course.at(ramp.begin_s + i * 1e-3 * ramp.duration_s).v) for i in range(1001)]
         step_s = 1e-3 * ramp.duration_s
-        braking = max(abs(b - a) / step_s for a, b in zip(speeds, speeds[1:], strict=False))
+        braking = max(abs(b - a) / step_s for a, b in itertools.pairwise(speeds))
         assert braking < 1.3 * RUN_OUT_ACCELERATION_M_S2
     assert slow.ramps[0].duration_s < fast.ramps[0].duration_s
 

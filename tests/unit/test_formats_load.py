@@ -14,10 +14,11 @@ from companion.cli.common import adjustments, trajectory_changes
 from companion.config import build_flight, load_flight, read_toml
 from companion.errors import InputError, RefusedError
 from companion.flight import launch
-from companion.flight.inspection import gate_ground, reference_problems
+from companion.flight.inspection import reference_problems
 from companion.flight.phases import Autopilot
 from companion.flight.preflight import gate_place, gate_reference
 from companion.flight.reports import take_report
+from companion.flight.surroundings import gate_ground
 from companion.frames import GeoPoint
 from companion.link.framing import Frame
 from companion.record.folder import CONFIGURATION_FILE, create_flight_folder, write_configuration

@@ -15,7 +15,8 @@ from format_cases import DATA, FENCE, HOME, SQUARE, item, place, plan, wpl
 from companion.config import Vehicle, load_vehicle
 from companion.control.types import Vec3
 from companion.errors import InputError, RefusedError
-from companion.flight.inspection import place_problems, reference_problems
+from companion.flight.inspection import reference_problems
+from companion.flight.surroundings import place_problems
 from companion.frames import GeoPoint, ned_from_geo
 from companion.trajectory.anchored import Origin, Trajectory, anchored
 from companion.trajectory.earth import home_for

@@ -98,6 +98,12 @@ def test_a_refused_upload_changes_nothing(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [".catalogue.json", "lap.csv"]
 
 
+def test_a_verdict_names_the_file_as_people_know_it(tmp_path):
+    store = make_store(tmp_path, lambda path: f"read '{path}', {path}: 3 points, {path.name} twice")
+    done = put(store, "a+b (1).csv", b"x\n")
+    assert done.finding.verdict == "read 'a+b (1).csv', a+b (1).csv: 3 points, a+b (1).csv twice"
+
+
 def test_a_check_with_a_fault_refuses(tmp_path):
     def broken(path):
         raise ZeroDivisionError("division by zero")

@@ -16,7 +16,7 @@ from companion.ground.store import Limits, TrajectoryStore
 from companion.ground.upload import Files, StoredFile
 
 LINES = b"".join(b"%d,%f,%f,0.0\n" % (i, i * 0.1, i * 0.01) for i in range(60_000))
-MEGABYTE = LINES[: 1_000_000]
+MEGABYTE = LINES[:1_000_000]
 
 
 def client(network, **options):
@@ -226,15 +226,15 @@ def test_a_verdict_that_does_not_come(tmp_path):
             return None
 
     network = Network(FileServer(TrajectoryStore(tmp_path, Never())))
-    with pytest.raises(LinkError, match="no verdict came within 20 s"):
+    with pytest.raises(LinkError, match="there is no verdict after 20 s"):
         client(network).upload_bytes(b"x\n", "a.csv", verdict_patience_s=20.0)
 
 
 def test_the_pace():
     pace = Pace()
-    for i in range(200):
-        pace.sample(0.01, i * 0.01)
-    assert pace.window == pytest.approx(WINDOW_MAX, rel=0.2)
+    for i in range(2000):
+        pace.sample(0.01, i * 0.001)
+    assert pace.window == WINDOW_MAX
     assert 0.05 <= pace.timeout_s(1) < 0.06
     assert pace.timeout_s(20) == 2.0
     for i in range(200):

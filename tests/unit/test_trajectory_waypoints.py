@@ -7,19 +7,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import minimize
 from waypoint_cases import LIMITS, cost, dense_cost, points, turning_limits, with_demands
 
 from companion.config import load_vehicle
 from companion.control.types import Reference
 from companion.errors import InputError, RefusedError
+from companion.trajectory.allocation import Allocation
 from companion.trajectory.anchored import Trajectory, anchored
-from companion.trajectory.batch import batch, quantities, torque_uses, uses
-from companion.trajectory.demands import Gauge
+from companion.trajectory.batch import Batch, batch, quantities, torque_uses, uses
 from companion.trajectory.feasibility import check
 from companion.trajectory.load import load
-from companion.trajectory.minimum_snap import Knots
+from companion.trajectory.minimum_snap import Knots, basis, solve
 from companion.trajectory.piecewise import Piecewise
-from companion.trajectory.planner import _knots
+from companion.trajectory.planner import _knots, _refuse_excess
 from companion.trajectory.waypoints import PlanLimits, Waypoint, plan, plan_limits
 
 CALM = replace(LIMITS, wind_m_s=0.0)
@@ -41,7 +42,7 @@ def largest_use(shape: Piecewise, limits: PlanLimits) -> float:
 
 
 @given(seed=st.integers(0, 10_000), count=st.integers(2, 10))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_plans_are_smooth_pass_the_check_and_cost_the_least(seed: int, count: int) -> None:
     waypoints = with_demands(seed, points(seed, count))
     shape = plan(waypoints, LIMITS)
@@ -94,11 +95,12 @@ def test_torque_is_kept_where_it_is_what_there_is_least_of() -> None:
 
 
 def test_wind_from_any_side_is_left_room_for() -> None:
-    limits = replace(LIMITS, wind_m_s=3.0)
+    windy = replace(CALM, reference=replace(CALM.reference, tilt_max_rad=0.4, thrust_max_n=13.0))
+    limits = replace(windy, wind_m_s=3.0)
     shape = plan(points(5, 6), limits)
     times = dense_times(shape, 30).tolist()
     found = batch(shape, times)
-    assert shape.own_duration_s > plan(points(5, 6), CALM).own_duration_s
+    assert shape.own_duration_s > 1.05 * plan(points(5, 6), windy).own_duration_s
     rng = np.random.default_rng(0)
     worst = 0.0
     for _ in range(200):
@@ -111,38 +113,35 @@ def test_wind_from_any_side_is_left_room_for() -> None:
     assert 0.95 <= worst <= 1.0 + 1e-6
 
 
-def scaled_total(durations_s: np.ndarray, knots: Knots, gauge: Gauge) -> float:
-    """The duration of these proportions with the factor with which the limits just hold."""
-    from companion.trajectory.allocation import worst
-    from companion.trajectory.minimum_snap import solve
+def scaled_total(durations_s: np.ndarray, knots: Knots) -> float:
+    """The duration of these proportions, times the factor with which the limits just hold."""
+    y = solve(knots, durations_s).local()
+    v, a, j = ((basis(4).values(k, np.linspace(0.0, 1.0, 60)) @ y / durations_s**k).reshape(3, -1) for k in (1, 2, 3))
+    zero = np.zeros_like(v)
 
-    low, high = 0.1, 1.0
-    while worst(solve(knots, durations_s * high), gauge).max() > 0.0:
-        low, high = high, 2.0 * high
-    for _ in range(14):
-        middle = 0.5 * (low + high)
-        if worst(solve(knots, durations_s * middle), gauge).max() > 0.0:
-            low = middle
-        else:
-            high = middle
+    def too_fast(factor: float) -> bool:
+        slower = Batch(zero, v / factor, a / factor**2, j / factor**3, zero, zero)
+        return bool(uses(quantities(slower, CALM.model), CALM.reference).max() > 1.0)
+
+    low, high = 0.01, 100.0
+    for _ in range(20):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if too_fast(middle) else (low, middle)
     return float(durations_s.sum()) * high
 
 
-@pytest.mark.parametrize(("seed", "count"), [(1, 3), (7, 4)])
+@pytest.mark.parametrize(("seed", "count"), [(1, 3), (7, 4), (4, 5)])
 def test_duration_is_near_that_of_a_direct_search(seed: int, count: int) -> None:
-    from scipy.optimize import minimize
-
     waypoints = points(seed, count)
     shape = plan(waypoints, CALM)
     knots = _knots(waypoints, np.array([w.p_m for w in waypoints]).T)
-    gauge = Gauge(CALM.reference, CALM.model)
-    start = np.log(np.linalg.norm(knots.steps, axis=0))
-
-    def total(z: np.ndarray) -> float:
-        return scaled_total(np.exp(z), knots, gauge)
-
-    found = minimize(total, start, method="Nelder-Mead", options={"maxfev": 60})
-    assert shape.own_duration_s <= 1.02 * found.fun
+    best = math.inf
+    for start in (np.diff(shape.knots_s), np.linalg.norm(knots.steps, axis=0)):
+        found = minimize(
+            lambda z: scaled_total(np.exp(z), knots), np.log(start), method="Nelder-Mead", options={"maxfev": 100}
+        )
+        best = min(best, found.fun)
+    assert shape.own_duration_s <= 1.02 * best
 
 
 def test_a_close_pair_between_far_points_does_no_harm() -> None:
@@ -277,9 +276,10 @@ def test_wrong_waypoints(waypoints: list[Waypoint], limits: PlanLimits, message:
 
 
 def test_a_speed_that_no_durations_allow_is_refused() -> None:
-    corner = [Waypoint((0.0, 0.0, 0.0)), Waypoint((0.3, 0.0, 0.0), speed_m_s=5.5), Waypoint((0.3, 0.3, 0.0))]
-    with pytest.raises(RefusedError, match=r"^waypoint\.1: no durations keep the limits between waypoint\.[01] and"):
-        plan(corner, LIMITS)
+    found = Allocation(np.ones(2), np.array([0.1, 0.2]))
+    with pytest.raises(RefusedError, match=r"^waypoint\.1: no durations .* waypoint\.1 and waypoint\.2: .* by 20 %"):
+        _refuse_excess(found, [A, replace(B, speed_m_s=5.0), C])
+    _refuse_excess(Allocation(np.ones(2), np.array([-0.1, 1e-7])), [A, B, C])
 
 
 def test_a_wind_in_which_it_cannot_rest_is_refused() -> None:

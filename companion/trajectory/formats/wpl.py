@@ -5,6 +5,9 @@ Where the first item is absolute while it is also the current one, it is the hom
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import isnan
+
 from companion.frames import Frame, GeoPoint
 from companion.trajectory.fence import Fence
 from companion.trajectory.formats.contents import Route
@@ -15,6 +18,8 @@ COLUMNS = ("index", "current", "frame", "command", "p1", "p2", "p3", "p4", "x", 
 SIGNATURE = "QGC WPL"
 VERSION = "110"
 INTEGER_MAX = 65535.0
+FRAMES_OF_INTEGERS = {5: 0, 6: 3}
+"""MAV_FRAME of MISSION_ITEM_INT, as these files have them."""
 
 
 def matches(source: Source) -> bool:
@@ -88,3 +93,28 @@ def _home(row: Row) -> GeoPoint | None:
     if abs(latitude) > 90.0 or abs(longitude) > 180.0 or abs(altitude) > 9000.0 or latitude == longitude == 0.0:
         return None
     return GeoPoint(latitude, longitude, altitude)
+
+
+def text_of(home: GeoPoint, items: Sequence[tuple[int, int, tuple[float, float, float, float], GeoPoint]]) -> str:
+    """Return a mission as such a file.
+
+    Args:
+        home: the home position, altitude above mean sea level.
+        items: command, frame, parameters (NaN: not set) and place of each, the mission's and the fence's.
+
+    """
+    lines = [f"{SIGNATURE} {VERSION}", _line(0, 1, 0, WAYPOINT, (0.0, 0.0, 0.0, 0.0), home)]
+    for index, (command, frame, params, place) in enumerate(items, start=1):
+        p1, p2, p3, p4 = (0.0 if isnan(value) else value for value in params)
+        if command in (WAYPOINT, TAKEOFF) and params[3] == 0.0:
+            p4 = 360.0  # zero leaves the heading open in these files
+        lines.append(_line(index, 0, FRAMES_OF_INTEGERS.get(frame, frame), command, (p1, p2, p3, p4), place))
+    return "\n".join(lines) + "\n"
+
+
+def _line(
+    index: int, current: int, frame: int, command: int, params: tuple[float, float, float, float], place: GeoPoint
+) -> str:
+    numbers = "\t".join(f"{value:.8g}" for value in params)
+    where = f"{place.latitude_deg:.8f}\t{place.longitude_deg:.8f}\t{place.altitude_m:.6f}"
+    return f"{index}\t{current}\t{frame}\t{command}\t{numbers}\t{where}\t1"

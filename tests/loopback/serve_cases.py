@@ -1,0 +1,173 @@
+"""`companion serve` as a process for tests, with the bundled vehicle in lockstep in this one."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from flight_cases import HOVER, Stand, make_flight
+from pymavlink.dialects.v20 import development as mavlink
+
+from companion.config import find, read_toml
+from companion.flight.bundled import free_udp_port
+from companion.ground.client import Client
+
+PATIENCE_S = 60.0
+LONG_HOVER = dict(HOVER) | {"duration_s": 200.0}
+LONG_CIRCLE = read_toml(find("circle", "trajectories")) | {"laps": 50}
+TRAJECTORIES: dict[str, dict[str, Any]] = {"circle": LONG_CIRCLE, "hover": LONG_HOVER}
+
+
+def until(condition: Callable[[], object], what: str = "") -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end_s, what
+        time.sleep(0.01)
+
+
+class Serving:
+    """One `companion serve`; use it as a context manager."""
+
+    def __init__(self, folder: Path, vehicle_port: int, *options: str) -> None:
+        self.folder = folder
+        self.port = free_udp_port()
+        self.to = f"udpout:127.0.0.1:{self.port}"
+        self.lines: list[str] = []
+        trajectories = folder / "trajectories"
+        trajectories.mkdir(parents=True, exist_ok=True)
+        for name, data in TRAJECTORIES.items():
+            text = tomlkit.dumps({key: value for key, value in data.items() if key != "name"})
+            (trajectories / f"{name}.toml").write_text(text)
+        vehicle = folder / "serve_vehicle.toml"
+        vehicle.write_text(tomlkit.dumps(make_flight().vehicle.model_dump(mode="json", exclude_none=True)))
+        self._command = [
+            *(sys.executable, "-m", "companion", "serve", "--vehicle", str(vehicle), "--engine", "python"),
+            *("--connect", f"udpin:127.0.0.1:{vehicle_port}", "--ground", f"udpin:127.0.0.1:{self.port}"),
+            *("--folder", str(trajectories), "--flights", str(folder / "flights"), "--json"),
+            *("--no-reports", *options),
+        ]
+        self._log = folder / "serve.log"
+
+    def __enter__(self) -> Serving:
+        with self._log.open("w") as log:
+            self.process = subprocess.Popen(
+                self._command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
+            )
+        assert self.process.stdout is not None
+        self.facts = json.loads(self.process.stdout.readline() or "{}")
+        assert self.facts.get("ready"), self.log
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.wait(20.0)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+        self.process.communicate()
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def pid(self, module: str) -> int | None:
+        """Of a child that is there now."""
+        for folder in Path("/proc").iterdir():
+            if not folder.name.isdigit():
+                continue
+            with contextlib.suppress(OSError):
+                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+                if parent == self.process.pid and module.encode() in (folder / "cmdline").read_bytes():
+                    return int(folder.name)
+        return None
+
+    @property
+    def control_pid(self) -> int | None:
+        return self.pid("companion.ground.control")
+
+    @property
+    def ground_pid(self) -> int | None:
+        return self.pid("companion.ground.process")
+
+    def kill(self, pid: int | None) -> None:
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+
+    @contextlib.contextmanager
+    def client(self) -> Iterator[Client]:
+        """A client of a companion that hears its vehicle and has checked its trajectories."""
+        with Client(self.to, PATIENCE_S) as client:
+            until(lambda: client.status(5.0).vehicle, "the vehicle is not heard")
+            until(lambda: all(t.accepted for t in client.trajectories()), str(client.trajectories()))
+            yield client
+
+    def summaries(self) -> list[dict[str, Any]]:
+        """Of the flights so far, in their order."""
+        return [json.loads(path.read_text()) for path in sorted((self.folder / "flights").glob("*/summary.json"))]
+
+
+@contextlib.contextmanager
+def serving(folder: Path, **stand_options: Any) -> Iterator[tuple[Serving, Stand]]:
+    """A vehicle in the air and the companion that serves it."""
+    with Stand(make_flight(), folder, **stand_options) as stand, Serving(folder, stand.port) as serve:
+        yield serve, stand
+
+
+class PlainTool:
+    """A ground tool made of pymavlink and a socket, as anybody would write it."""
+
+    def __init__(self, port: int) -> None:
+        self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sock.settimeout(0.2)
+        self.companion = ("127.0.0.1", port)
+        self.mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        self.heard: list[Any] = []
+
+    def __enter__(self) -> PlainTool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.sock.close()
+
+    def send(self, message: Any) -> None:
+        self.sock.sendto(message.pack(self.mav), self.companion)
+
+    def receive(self, seconds: float = 0.2) -> None:
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            with contextlib.suppress(TimeoutError):
+                self.heard += self.mav.parse_buffer(bytearray(self.sock.recv(2048))) or []
+
+    def command(self, command: int, *params: float, whole: bool = False, confirmation: int = 0) -> list[int]:
+        """Gives a command; returns the results of its acknowledgements, the last one final."""
+        values = (*params, *(0.0,) * (7 - len(params)))
+        if whole:
+            x, y, z = int(values[4]), int(values[5]), values[6]
+            message = mavlink.MAVLink_command_int_message(1, 191, 0, command, 0, 0, *values[:4], x, y, z)
+        else:
+            message = mavlink.MAVLink_command_long_message(1, 191, command, confirmation, *values)
+        self.heard.clear()
+        self.send(message)
+        end_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end_s:
+            self.receive(0.05)
+            acks = [m for m in self.heard if m.get_type() == "COMMAND_ACK" and m.command == command]
+            if acks and acks[-1].result != mavlink.MAV_RESULT_IN_PROGRESS:
+                assert {(ack.target_system, ack.target_component) for ack in acks} == {(255, 190)}
+                return [ack.result for ack in acks]
+        raise AssertionError(f"command {command} was not answered")
+
+    def said(self) -> str:
+        """All texts so far."""
+        return "".join(m.text for m in self.heard if m.get_type() == "STATUSTEXT")
