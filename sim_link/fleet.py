@@ -67,9 +67,8 @@ class Member(Peer):
         self.companion.together = True  # fewer datagrams: they are most of what a vehicle costs besides its physics
         end_s = math.inf if duration_s is None else duration_s
         self._end_us = self.vehicle.start_us + end_s * 1e6
-        self._muted.clear()
-        for descriptor in self.descriptors:
-            self._poll.register(descriptor, select.POLLIN)
+        for intake in self._intakes:
+            intake.listen()
 
     @property
     def descriptors(self) -> list[int]:
@@ -124,9 +123,8 @@ class Member(Peer):
             return False
         if self.due_s < math.inf:
             self.due_s = math.inf
-            for descriptor in self.descriptors:
-                if descriptor not in self._muted:
-                    self._poll.unregister(descriptor)
+            for intake in self._intakes:
+                intake.ignore()
         return True
 
     def close(self) -> None:

@@ -6,8 +6,7 @@ moves on. PX4's clock is the time in HIL_SENSOR (its modules/simulation/simulato
 4000 us from sample to sample.
 
 The wait is bounded: PX4 gives no controls while it boots, and whenever its control allocation is off. After PATIENCE_S
-without an answer the world goes on at real time with the last controls, until controls for the present sample come
-again.
+without an answer the world goes on at real time with the last controls, until PX4 gives new ones.
 """
 
 from __future__ import annotations
@@ -177,6 +176,8 @@ class Hil:
         """The newest ones."""
         self.synchronous = False
         """Whether the world waits for PX4's controls."""
+        self._heard_us = 0
+        """Of the newest controls when it did not, the time."""
         self.misses = 0
         """Samples of which PX4's controls did not come in time."""
         self.samples = 0
@@ -225,9 +226,12 @@ class Hil:
         self.samples += 1
         if self._log is not None:
             self._log.write(world.airframe.truth())
+        if not self.synchronous:
+            self._run_free(link)
         if self.synchronous:
             self._wait_for_controls(link)
-        self._wait_for_time(link)
+        if self.synchronous:
+            self._wait_for_time()
         if self.samples % 250 == 0:
             self._refuse_others()
         a, b, c, d = self.controls.controls[:4]
@@ -241,6 +245,7 @@ class Hil:
             if left_s <= 0.0:
                 self.misses += 1
                 self.synchronous = False
+                self._heard_us = self.controls.t_us
                 self._deadline_s = time.monotonic()
                 self._notice(f"no controls from PX4 for {self.options.patience_s:g} s: going on at real time")
                 return
@@ -248,26 +253,31 @@ class Hil:
                 return
             self._serve(link, min(left_s, _SLICE_S))
 
-    def _wait_for_time(self, link: Px4Link) -> None:
-        """Let the wall clock catch up; without lockstep take in what PX4 says meanwhile."""
-        speed = self.options.speed if self.synchronous else min(1.0, self.options.speed)
-        self._deadline_s += SAMPLE_US * 1e-6 / speed
-        now_s = time.monotonic()
-        if now_s - self._deadline_s > _LATE_MAX_S:
-            self._deadline_s = now_s
-        if self.synchronous:
-            while (left_s := self._deadline_s - time.monotonic()) > 0.0 and not self._stopped():
-                time.sleep(min(left_s, _SLICE_S))
-            return
+    def _wait_for_time(self) -> None:
+        """Let the wall clock catch up."""
+        self._set_deadline(self.options.speed)
+        while (left_s := self._deadline_s - time.monotonic()) > 0.0 and not self._stopped():
+            time.sleep(min(left_s, _SLICE_S))
+
+    def _run_free(self, link: Px4Link) -> None:
+        """Let a sample's time pass without controls. New ones, of whichever sample, show that PX4 is at work."""
+        self._set_deadline(min(1.0, self.options.speed))
         while True:
             left_s = self._deadline_s - time.monotonic()
             self._serve(link, min(max(left_s, 0.0), _SLICE_S))
-            if self.controls.t_us >= self.world.t_us:
+            if self.controls.t_us > self._heard_us:
                 self.synchronous = True
                 self._notice("PX4 gives controls: in lockstep")
                 return
             if left_s <= 0.0 or self._stopped():
                 return
+
+    def _set_deadline(self, speed: float) -> None:
+        """Set when the present sample is over."""
+        self._deadline_s += SAMPLE_US * 1e-6 / speed
+        now_s = time.monotonic()
+        if now_s - self._deadline_s > _LATE_MAX_S:
+            self._deadline_s = now_s
 
     def _serve(self, link: Px4Link, timeout_s: float) -> None:
         """Take in what PX4 sends."""

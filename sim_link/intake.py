@@ -7,6 +7,7 @@ receiver that is asked too much.
 
 from __future__ import annotations
 
+import select
 from collections import deque
 
 from .codec import Frame
@@ -25,26 +26,42 @@ def allowance(state_period_s: float, sharers: int = 1) -> int:
 
 
 class Intake:
-    """The messages of one socket."""
+    """The messages of one socket, which is registered in a poll while more of them may be acted on."""
 
-    def __init__(self, endpoint: UdpEndpoint, per_state: int) -> None:
+    def __init__(self, endpoint: UdpEndpoint, poll: select.poll, per_state: int) -> None:
         self._endpoint = endpoint
-        self.per_state = per_state
-        """The allowance that `refill` gives."""
+        self._poll = poll
+        self._listens = False
+        self._per_state = per_state
         self.left = per_state
         """What is left of it; whoever acts on a message takes its answers off."""
         self._pending: deque[Frame] = deque()
         """Of a datagram that was begun."""
         self._sender: Address = ("", 0)
 
-    @property
-    def used_up(self) -> bool:
-        """Whether nothing more is acted on before the next state."""
-        return self.left <= 0
+        self.listen()
+
+    def listen(self) -> None:
+        """Let the poll wake up for the socket."""
+        if not self._listens:
+            self._listens = True
+            self._poll.register(self._endpoint.fileno(), select.POLLIN)
+
+    def ignore(self) -> None:
+        """Let the poll not wake up for the socket."""
+        if self._listens:
+            self._listens = False
+            self._poll.unregister(self._endpoint.fileno())
 
     def refill(self) -> None:
         """Begin a new state."""
-        self.left = self.per_state
+        self.left = self._per_state
+        self.listen()
+
+    def rest(self) -> None:
+        """Ignore the socket until the next state, if the allowance is used up."""
+        if self.left <= 0:
+            self.ignore()
 
     def next(self, faults: LinkFaults | None) -> tuple[Frame, Address] | None:
         """Give the next message and its sender; None when nothing is there, or the allowance is used up. Never blocks.

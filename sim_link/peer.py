@@ -121,12 +121,8 @@ class Peer:
         self._notice = notice
         self._endpoints = [self.companion] if self.ground is None else [self.companion, self.ground]
         self._poll = select.poll() if poll is None else poll
-        for endpoint in self._endpoints:
-            self._poll.register(endpoint.fileno(), select.POLLIN)
         per_state = allowance(self.state_wall_s, sharers)
-        self._intakes = [Intake(endpoint, per_state) for endpoint in self._endpoints]
-        self._muted: list[int] = []
-        """Sockets whose allowance is used up: nobody waits for them before the next state."""
+        self._intakes = [Intake(endpoint, self._poll, per_state) for endpoint in self._endpoints]
         self._waiting: deque[tuple[list[Frame], Address]] = deque()
         self._spin_vain = 0
         """States for which sleeping at once is the better choice, when polling was in vain last."""
@@ -336,15 +332,6 @@ class Peer:
         """Let every socket be heard anew: a new state has begun."""
         for intake in self._intakes:
             intake.refill()
-        for descriptor in self._muted:
-            self._poll.register(descriptor, select.POLLIN)
-        self._muted.clear()
-
-    def _mute_if_used_up(self, intake: Intake, endpoint: UdpEndpoint) -> None:
-        """Do not wait for a socket any more whose allowance is used up."""
-        if intake.used_up and endpoint.fileno() not in self._muted:
-            self._poll.unregister(endpoint.fileno())
-            self._muted.append(endpoint.fileno())
 
     def _hear_companion(self) -> None:
         """Act on what the companion has sent: in lockstep up to its answer, else as far as the allowance goes."""
@@ -357,7 +344,7 @@ class Peer:
             if heard is None:
                 break
             intake.left -= self._take(*heard)
-        self._mute_if_used_up(intake, self.companion)
+        intake.rest()
 
     def _hear_until_answer(self) -> None:
         """Act on the companion's datagrams, but none beyond its answer: those belong to the next state."""
@@ -403,7 +390,7 @@ class Peer:
             queued = len(link.outbox)
             self._obey(frame, link)
             intake.left -= len(link.outbox) - queued
-        self._mute_if_used_up(intake, self.ground)
+        intake.rest()
 
     def _obey(self, frame: Frame, link: Link) -> None:
         """Act on a message that is neither an order of faults nor part of the lockstep exchange."""

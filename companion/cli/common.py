@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -65,6 +66,54 @@ def say(text: str, *, quiet: bool = False) -> None:
     print(text, file=sys.stderr if quiet else sys.stdout, flush=True)
 
 
+LiveOption = Annotated[
+    bool, typer.Option("--live", help="Show the flight in the terminal while it lasts: figures and a small plan.")
+]
+RerunOption = Annotated[
+    bool, typer.Option("--rerun", help="Stream the flight to the rerun viewer (needs the extra [live]).")
+]
+RerunFileOption = Annotated[
+    Path | None, typer.Option("--rerun-file", metavar="FILE", help="The same into a .rrd file, for later.")
+]
+Display = Callable[[Mapping[str, Any]], None]
+"""Gets every message of the control process."""
+
+
+@contextlib.contextmanager
+def flight_display(*, quiet: bool, live: bool, rerun: bool, rerun_file: Path | None) -> Iterator[Display]:
+    """What shows a flight, as the options ask; to be opened before anything connects.
+
+    Raises:
+        InputError: rerun cannot be used.
+    """
+    if rerun and rerun_file is not None:
+        raise InputError(f"--rerun starts the viewer, --rerun-file {rerun_file} keeps the flight: leave one out")
+    with contextlib.ExitStack() as stack:
+        displays: list[Display] = []
+        if rerun or rerun_file is not None:
+            from companion.cli.rerun_stream import RerunStream
+
+            displays.append(stack.enter_context(RerunStream(rerun_file)))
+        if live and (sys.stderr if quiet else sys.stdout).isatty():
+            from companion.cli.live import LiveDisplay
+
+            displays.append(stack.enter_context(LiveDisplay(quiet)))
+        else:
+            if live:
+                say("--live needs a terminal; the flight's lines are shown", quiet=quiet)
+            displays.append(stack.enter_context(FlightDisplay(quiet)))
+
+        def show(message: Mapping[str, Any]) -> None:
+            for display in list(displays):
+                try:
+                    display(message)
+                except Exception as error:
+                    displays.remove(display)
+                    say(f"companion: a display failed ({error}); the flight goes on", quiet=True)
+
+        yield show
+
+
 class FlightDisplay:
     """Shows the status messages of a control process: lines as they come, a progress bar while tracking."""
 
@@ -111,6 +160,7 @@ def fly_bundled(
     faults: Path | None,
     timeout_s: float,
     quiet: bool,
+    display: Display,
 ) -> Flown:
     """Starts the bundled vehicle, flies it, and ends it.
 
@@ -123,14 +173,13 @@ def fly_bundled(
     where = "on the ground" if flight.start is None else "in Hold"
     with BundledVehicle(flight, folder, px4=px4, engine=engine, lockstep=lockstep, faults=faults) as bundled:
         say(f"the bundled vehicle ({flight.vehicle.name}) waits {where}; flight folder {folder}", quiet=quiet)
-        with FlightDisplay(quiet=quiet) as display:
 
-            def listen(message: Mapping[str, Any]) -> None:
-                display(message)
-                if "flown" in message:  # it would wait for a companion that has gone
-                    bundled.stop()
+        def listen(message: Mapping[str, Any]) -> None:
+            display(message)
+            if "flown" in message:  # it would wait for a companion that has gone
+                bundled.stop()
 
-            return control(folder, bundled.connection, engine, timeout_s, listen)
+        return control(folder, bundled.connection, engine, timeout_s, listen)
 
 
 def fault_file(name: str | None) -> Path | None:

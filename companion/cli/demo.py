@@ -13,7 +13,10 @@ from companion.cli.common import (
     FaultsOption,
     FrameOption,
     JsonOption,
+    LiveOption,
     OutOption,
+    RerunFileOption,
+    RerunOption,
     TimeScaleOption,
     TrajectoryOption,
     TurbulenceOption,
@@ -22,6 +25,7 @@ from companion.cli.common import (
     adjustments,
     controller_changes,
     fault_file,
+    flight_display,
     fly_bundled,
     report_flight,
     say_notes,
@@ -53,6 +57,9 @@ def run(
     real_time: Annotated[bool, typer.Option("--real-time", help="Fly at real time instead of in lockstep.")] = False,
     out: OutOption = None,
     engine: EngineOption = "auto",
+    live: LiveOption = False,
+    rerun: RerunOption = False,
+    rerun_file: RerunFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Flies the demo and leaves a flight folder with report.html."""
@@ -78,16 +85,18 @@ def run(
     start_of(configured)
     say_notes(of_flight(configured).notes, quiet=as_json)
     faults_path = fault_file(faults)
-    folder = prepare(configured, out)
     version = px4 or ("1.13" if configured.output.sends == "actuators" else "1.18")
-    flown = fly_bundled(
-        configured,
-        folder,
-        px4=version,
-        engine=engine,
-        lockstep=not real_time,
-        faults=faults_path,
-        timeout_s=CONNECT_TIMEOUT_S,
-        quiet=as_json,
-    )
+    with flight_display(quiet=as_json, live=live, rerun=rerun, rerun_file=rerun_file) as display:
+        folder = prepare(configured, out)
+        flown = fly_bundled(
+            configured,
+            folder,
+            px4=version,
+            engine=engine,
+            lockstep=not real_time,
+            faults=faults_path,
+            timeout_s=CONNECT_TIMEOUT_S,
+            quiet=as_json,
+            display=display,
+        )
     raise typer.Exit(report_flight(flown, as_json=as_json))

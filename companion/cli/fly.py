@@ -15,15 +15,18 @@ from companion.cli.common import (
     ControllerOption,
     EngineOption,
     FaultsOption,
-    FlightDisplay,
     FrameOption,
     JsonOption,
+    LiveOption,
     OutOption,
+    RerunFileOption,
+    RerunOption,
     TimeScaleOption,
     VehicleOption,
     adjustments,
     controller_changes,
     fault_file,
+    flight_display,
     fly_bundled,
     report_flight,
     say,
@@ -60,6 +63,9 @@ def run(
     timeout: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for the vehicle.")] = 15.0,
     out: OutOption = None,
     engine: EngineOption = "auto",
+    live: LiveOption = False,
+    rerun: RerunOption = False,
+    rerun_file: RerunFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Flies the trajectory and leaves a flight folder."""
@@ -96,20 +102,21 @@ def run(
         configured = load_flight(flight, adjustments(**changes, **vehicle_changes(vehicle)))
     complete = embedded(configured, time_scale)
     say_notes(of_flight(complete).notes, quiet=as_json)
-    folder = prepare(complete, out)
-    if sim:
-        flown = fly_bundled(
-            complete,
-            folder,
-            px4="1.13" if complete.output.sends == "actuators" else "1.18",
-            engine=engine,
-            lockstep=True,
-            faults=faults_path,
-            timeout_s=timeout,
-            quiet=as_json,
-        )
-        raise typer.Exit(report_flight(flown, as_json=as_json))
-    say(f"{configured.name}: {name} on {configured.vehicle.name}, listening on {connection}", quiet=as_json)
-    with FlightDisplay(quiet=as_json) as display:
-        flown = control(folder, connection, engine, timeout, display)
+    with flight_display(quiet=as_json, live=live, rerun=rerun, rerun_file=rerun_file) as display:
+        folder = prepare(complete, out)
+        if sim:
+            flown = fly_bundled(
+                complete,
+                folder,
+                px4="1.13" if complete.output.sends == "actuators" else "1.18",
+                engine=engine,
+                lockstep=True,
+                faults=faults_path,
+                timeout_s=timeout,
+                quiet=as_json,
+                display=display,
+            )
+        else:
+            say(f"{configured.name}: {name} on {configured.vehicle.name}, listening on {connection}", quiet=as_json)
+            flown = control(folder, connection, engine, timeout, display)
     raise typer.Exit(report_flight(flown, as_json=as_json))

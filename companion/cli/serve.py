@@ -119,5 +119,5 @@ def _flight(vehicle: str, flight: str | None, changes: dict[str, Any]) -> dict[s
         built = load_flight(flight, adjustments(**changes, **vehicle_changes(vehicle), trajectory=hover))
     if built.output.controller == "law":
         gate_gains(built.vehicle)
-    common = {"vehicle", "output", "acceptance", "takeoff_altitude_m", "after"}
-    return built.model_dump(mode="json", include=common, exclude_none=True)
+    own = {"name", "trajectory", "start", "world", "statistics_from_s"}  # of one flight, or of a simulated vehicle
+    return built.model_dump(mode="json", exclude=own, exclude_none=True)

@@ -10,7 +10,14 @@ DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
 
 
 def sketch(
-    x: Sequence[float], y: Sequence[float], *, columns: int, rows: int, same_scale: bool, plain: bool = False
+    x: Sequence[float],
+    y: Sequence[float],
+    *,
+    columns: int,
+    rows: int,
+    same_scale: bool,
+    plain: bool = False,
+    mark: int | None = None,
 ) -> list[str]:
     """Return lines that show points, x to the right and y upwards.
 
@@ -21,6 +28,7 @@ def sketch(
         rows: height [characters]; fewer come back where the points need fewer.
         same_scale: whether a metre is as long in x as in y.
         plain: stars instead of braille, for terminals that have none.
+        mark: the point with this index gets a character of its own, "o".
 
     """
     wide, high = 2 * columns - 1, 4 * rows - 1
@@ -38,6 +46,8 @@ def sketch(
         column = min(wide, round((px - left) * across))
         row = max(0, 4 * needed - 1 - round((py - bottom) * up))
         cells[row // 4][column // 2] |= DOTS[column % 2][row % 4]
-    if plain:
-        return ["".join("*" if cell else " " for cell in line).rstrip() for line in cells]
-    return ["".join(chr(BLANK + cell) if cell else " " for cell in line).rstrip() for line in cells]
+    shown = [["*" if plain and cell else chr(BLANK + cell) if cell else " " for cell in line] for line in cells]
+    if mark is not None:
+        row = max(0, 4 * needed - 1 - round((y[mark] - bottom) * up))
+        shown[row // 4][min(wide, round((x[mark] - left) * across)) // 2] = "o"
+    return ["".join(line).rstrip() for line in shown]

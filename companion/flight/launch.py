@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -37,23 +38,51 @@ class Flown:
     """How it ended, for people."""
 
 
+_PASSED_MAX = 32
+_passed: dict[str, None] = {}
+"""Flights that passed all gates in this process, oldest first: the same flight again needs not wait for them."""
+
+
+def gate(flight: Flight) -> None:
+    """All gates that need no vehicle.
+
+    Raises:
+        CompanionError: a gate refuses.
+    """
+    trajectory = of_flight(flight)
+    by_law = flight.output.controller == "law"  # the gains, and what is predicted with them, are the law's
+    if by_law:
+        gate_gains(flight.vehicle, brief=True)
+    gate_reference(trajectory, flight.vehicle)
+    gate_place(trajectory, flight.height_min_m)
+    if by_law:
+        gate_prediction(flight, trajectory, kernels("python"))
+
+
 def prepare(flight: Flight, out: Path | None) -> Path:
     """All gates that need no vehicle, then the flight folder with its flight.toml.
 
     Raises:
         CompanionError: a gate refuses, or the folder cannot be written; nothing has connected yet.
     """
-    trajectory = of_flight(flight)
-    by_law = flight.output.controller == "law"  # the gains, and what is predicted with them, are the law's
-    if by_law:
-        gate_gains(flight.vehicle)
-    gate_reference(trajectory, flight.vehicle)
-    gate_place(trajectory, flight.height_min_m)
-    if by_law:
-        gate_prediction(flight, trajectory, kernels("python"))
+    identity = _identity(flight)
+    if identity is None or identity not in _passed:
+        gate(flight)
+    if identity is not None:
+        _passed[identity] = None
+        while len(_passed) > _PASSED_MAX:
+            del _passed[next(iter(_passed))]
     folder = create_flight_folder(flight.name, out)
     write_configuration(folder, stored(flight, folder).model_dump(exclude_none=True))
     return folder
+
+
+def _identity(flight: Flight) -> str | None:
+    """What tells this flight from every other; None where a file outside of it may change unnoticed."""
+    table = flight.trajectory
+    if isinstance(table, str) or ("file" in table and "sha256" not in table):
+        return None
+    return sha256(flight.model_dump_json().encode()).hexdigest()
 
 
 def control(folder: Path, connection: str, engine: str, timeout_s: float, listen: Listener) -> Flown:

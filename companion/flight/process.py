@@ -106,7 +106,7 @@ class Ready:
         trajectory = of_flight(flight)
         compiled = kernels(engine)
         if flight.output.controller == "law":
-            gate_gains(flight.vehicle)
+            gate_gains(flight.vehicle, brief=True)
             line(f"engine: {compiled.engine}")
         else:
             line("controller: PX4's own, it gets the reference as setpoints")

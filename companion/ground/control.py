@@ -21,11 +21,10 @@ from typing import Any, Final
 
 from companion.config import build_flight
 from companion.errors import CompanionError, ExitCode, InputError, LinkError
-from companion.flight.connect import AUTOPILOT_COMPONENT, autopilot_system, send_heartbeat
+from companion.flight.connect import AUTOPILOT_COMPONENT
 from companion.flight.loop import FlightLoop, Progress
-from companion.flight.phases import Autopilot, Cause, FlightEnded, Order, Phase
+from companion.flight.phases import Cause, Order, Phase
 from companion.flight.process import Status, warm_up
-from companion.flight.reports import take_heartbeat, take_report
 from companion.flight.retuning import ParameterChange
 from companion.flight.tracker import kernels
 from companion.ground.channel import Channel, Copy, Outgoing
@@ -37,21 +36,16 @@ from companion.ground.parameters import WHAT as PARAMETERS
 from companion.ground.preparation import Closing, Preparation
 from companion.ground.report import Report
 from companion.ground.settings import Settings
+from companion.ground.standby import Standby
 from companion.ground.standing import IDLE, PREPARING, Standing
 from companion.ground.undertakings import Undertakings
-from companion.link import codec, modes, timesync
+from companion.link import codec, modes
 from companion.link.framing import Frame
-from companion.link.operations import Operation, Operations
+from companion.link.operations import Operation
 from companion.link.wire import COMPANION_COMPONENT, Wire
 from companion.record.recorder import Recorder
 
-IDLE_WAIT_S: Final = 0.02
 STANDING_INTERVAL_NS: Final = 200_000_000
-HEARTBEAT_INTERVAL_S: Final = 1.0
-UNHEARD_S: Final = 3.0
-"""Without a heartbeat of the autopilot for this long, there is none."""
-PEER_PATIENCE_S: Final = 5.0
-"""A peer that is no autopilot, or is silent, is given up after this time; not in flight."""
 ITEMS_PER_TURN: Final = 4
 """Of the ground process, so that it cannot keep a control turn."""
 CONNECT_TIMEOUT_S: Final = 15.0
@@ -84,12 +78,6 @@ class Control:
         self._undertakings = Undertakings(self._on_end)
         self._lines: deque[str] = deque()
         self._recorder: Recorder | None = None
-        self._autopilot = Autopilot()
-        self._system: int | None = None
-        self._heard_s = -math.inf
-        self._peer_since_s = time.monotonic()
-        self._spoken_s = -math.inf
-        self._ops: Operations | None = None
         self._landing: tuple[int, Operation] | None = None
         self._preparation: Preparation | None = None
         self._closing: Closing | None = None
@@ -111,6 +99,7 @@ class Control:
         self._warm_up()
         with Wire.open(self._settings.connection, tap=self._tap) as wire:
             self._wire = wire
+            self._standby = Standby(wire, self.on_frame, self._say)
             self._report.send(ready=True)
             while not self._stopping:
                 self._idle_turn()
@@ -144,18 +133,9 @@ class Control:
     # -- waiting --------------------------------------------------------------------------------------------------
 
     def _idle_turn(self) -> None:
-        for frame in self._wire.receive(IDLE_WAIT_S):
-            self._on_idle_frame(frame)
-        now_s = time.monotonic()
-        if now_s - self._spoken_s >= HEARTBEAT_INTERVAL_S:
-            self._spoken_s = now_s
-            if self._wire.peer is not None or self._system is not None:
-                send_heartbeat(self._wire)
-            self._stopping = self._stopping or self._report.closed
-        self._watch_peer(now_s)
-        if self._ops is not None:
-            self._ops.update(now_s)
-            self._follow_landing()
+        self._standby.turn()
+        self._stopping = self._stopping or self._report.closed
+        self._follow_landing()
         self.turn()
 
     def _closed(self) -> bool:
@@ -163,58 +143,6 @@ class Control:
         if self._closing is not None and self._closing.over:
             self._closing = None
         return self._closing is None
-
-    def _watch_peer(self, now_s: float) -> None:
-        """The first sender at the port is not always the vehicle, and a restarted one may come from another port."""
-        if now_s - max(self._heard_s, self._peer_since_s) < PEER_PATIENCE_S:
-            return
-        self._peer_since_s = now_s
-        if self._wire.last_foreign is not None:
-            self._wire.peer, self._wire.last_foreign = self._wire.last_foreign, None
-        else:
-            self._wire.release_peer()
-
-    def _on_idle_frame(self, frame: Frame) -> None:
-        if frame.msgid == codec.HEARTBEAT and frame.compid == AUTOPILOT_COMPONENT:
-            try:
-                system = autopilot_system(frame)
-            except FlightEnded as unusable:
-                if self._system is None:
-                    self._say(unusable.detail)
-                return
-            if system is not None and system != self._system:
-                self._meet(system, frame)
-        if frame.sysid != self._system or frame.compid != AUTOPILOT_COMPONENT:
-            self.on_frame(frame)
-            return
-        if frame.msgid == codec.TIMESYNC:
-            self._answer_time(frame)
-        elif frame.msgid == codec.HEARTBEAT:
-            self._heard_s = time.monotonic()
-            take_heartbeat(self._autopilot, frame)
-            self.on_frame(frame)
-        elif frame.msgid != codec.ODOMETRY:
-            if self._ops is None or not self._ops.on_frame(frame, time.monotonic()):
-                take_report(self._autopilot, frame)
-            self.on_frame(frame)
-
-    def _meet(self, system: int, frame: Frame) -> None:
-        """An autopilot, or another one than before."""
-        self._system = self._wire.system_id = system
-        self._autopilot = Autopilot()
-        self._ops = Operations(self._wire.send, system)
-        self._spoken_s = -math.inf
-        take_heartbeat(self._autopilot, frame)
-        mode = self._autopilot.mode
-        self._say(f"heard the autopilot: system {system}, mode {'unknown' if mode is None else mode.label}")
-        if mode == modes.OFFBOARD:
-            self._say("the vehicle is in Offboard and nothing here flies it: the autopilot's own failsafe acts")
-
-    def _answer_time(self, frame: Frame) -> None:
-        message = codec.decode_timesync(frame.payload)
-        if timesync.is_request(message, self._wire.system_id, self._wire.component_id):
-            answer = timesync.answer(message, time.monotonic_ns(), frame.sysid, frame.compid)
-            self._wire.send(codec.TIMESYNC, answer)
 
     # -- flying ---------------------------------------------------------------------------------------------------
 
@@ -238,15 +166,14 @@ class Control:
             status,
             connection=self._settings.connection,
             timeout_s=CONNECT_TIMEOUT_S,
-            system=self._system,
+            system=self._standby.system,
             host=self,
         )
         outcome = loop.run()
         ready.note_outcome(outcome)
         self._recorder = None
         self._loop = None
-        self._autopilot = replace(loop.autopilot)
-        self._heard_s = time.monotonic()
+        self._standby.autopilot = replace(loop.autopilot)
         well = outcome.cause in {Cause.COMPLETED, Cause.STOPPED}
         self._standing = replace(self._standing, phase=IDLE, paused=False, ended=outcome.sentence)
         self._flush_lines()
@@ -275,9 +202,9 @@ class Control:
 
     def on_frame(self, frame: Frame) -> None:
         """Copies for the ground process what it can use: the autopilot's slow messages, and what is addressed to us."""
-        if frame.sysid == self._system and frame.compid == AUTOPILOT_COMPONENT:
+        if frame.sysid == self._standby.system and frame.compid == AUTOPILOT_COMPONENT:
             if frame.msgid == codec.HEARTBEAT:
-                self._heard_s = frame.arrival_wall_ns * 1e-9
+                self._standby.on_heartbeat(frame)
             if frame.msgid not in COPIED:
                 return
         else:
@@ -308,12 +235,12 @@ class Control:
                 self._report.line("a fault of the program: " + traceback.format_exc(limit=3))
 
     def _send_for_ground(self, item: Outgoing) -> None:
-        if self._gate.passes(item.msgid, item.payload, self._system, time.monotonic()):
+        if self._gate.passes(item.msgid, item.payload, self._standby.system, time.monotonic()):
             self._wire.send(item.msgid, item.payload)
 
     def _tell_standing(self) -> None:
         loop = self._loop
-        autopilot = self._autopilot if loop is None else loop.autopilot
+        autopilot = self._standby.autopilot if loop is None else loop.autopilot
         mode = autopilot.mode
         phase = self._standing.phase
         if loop is not None:
@@ -322,8 +249,8 @@ class Control:
             phase = IDLE
         self._standing = replace(
             self._standing,
-            system=self._system,
-            heard=time.monotonic() - self._heard_s < UNHEARD_S,
+            system=self._standby.system,
+            heard=self._standby.heard,
             mode=None if mode is None else mode.label,
             custom_mode=0 if mode is None else mode.custom_mode,
             armed=autopilot.armed,
@@ -354,7 +281,7 @@ class Control:
             return "start: incomplete request"
         if self._loop is not None or self._preparation is not None:
             return f"start: {self._standing.trajectory} is under way; stop it first"
-        if time.monotonic() - self._heard_s > UNHEARD_S:
+        if not self._standby.heard:
             return f"start: no autopilot is heard at {self._settings.connection}"
         before = self._standing
         self._standing = Standing(
@@ -420,11 +347,11 @@ class Control:
             self._undertakings.fail("stopped by the operator")
             self._undertakings.add(number, order.value, lambda: self._preparation is None)
             return ""
-        if order is not Order.LAND or self._ops is None:
+        if order is not Order.LAND or self._standby.operations is None:
             return f"{order.value}: nothing is being flown"
         if self._landing is not None:
             return "land: a landing is being asked for already"
-        self._landing = number, self._ops.land(time.monotonic())
+        self._landing = number, self._standby.operations.land(time.monotonic())
         return ""
 
     def _follow_landing(self) -> None:
@@ -432,6 +359,8 @@ class Control:
             return
         number, operation = self._landing
         self._landing = None
+        if not operation.accepted:
+            self._say(operation.sentence, warning=True)
         self._on_end(number, operation.accepted, "" if operation.accepted else operation.sentence)
 
     def _on_end(self, number: int, done: bool, sentence: str) -> None:

@@ -37,12 +37,13 @@ def judge(flight: dict[str, Any], path: Path) -> str:
     Raises:
         CompanionError: what is wrong.
     """
-    from companion.flight.preflight import gate_reference
+    from companion.flight.preflight import gate_place, gate_reference
     from companion.trajectory.load import load
 
-    vehicle = build_flight({**flight, "name": "check", "trajectory": str(path)}, "companion serve").vehicle
-    trajectory = load(path, vehicle=vehicle, confined=True)
-    gate_reference(trajectory, vehicle)
+    whole = build_flight({**flight, "name": "check", "trajectory": str(path)}, "companion serve")
+    trajectory = load(path, vehicle=whole.vehicle, confined=True)
+    gate_reference(trajectory, whole.vehicle)
+    gate_place(trajectory, whole.height_min_m)
     return f"{VERDICT}: {trajectory.duration_s:.1f} s"
 
 

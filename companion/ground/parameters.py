@@ -343,6 +343,8 @@ class ParameterServer:
         self._job = None if self._job is job else self._job
         askers = {link.name: link for link in job.askers.values()}
         for link in (askers | self._links).values():
+            if job.name == RESET:  # the answer is the value that was set; then it is 0 again
+                link.send(codec.PARAM_VALUE, encode_value(RESET, job.raw, INT32, _INDEX[RESET], COUNT))
             for name in names:
                 link.send(codec.PARAM_VALUE, self._value(name))
 

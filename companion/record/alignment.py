@@ -52,7 +52,7 @@ class Fit(NamedTuple):
     """How two motions lie over each other."""
 
     offset_s: float
-    """To be added to the second one's times."""
+    """To be added to the second one's times; to a tenth of a millisecond."""
     agreement: float
     """Share of the velocities' variance that both have in common: 1 for equal ones."""
     velocity_rms_m_s: float
@@ -210,7 +210,7 @@ def _fit(first: Motion, second: Motion, offset_s: float) -> Fit:
     north, east, down = (float(x) for x in mean)
     step_s = float(np.median(np.diff(first.t_s)))
     return Fit(
-        offset_s=offset_s,
+        offset_s=round(offset_s, 4) + 0.0,
         agreement=1.0 - square / variance if variance > 0.0 else 0.0,
         velocity_rms_m_s=float(np.sqrt(square)),
         position_rms_m=float(np.sqrt((((position - mean) ** 2).sum(axis=1)).mean())),

@@ -128,7 +128,7 @@ def base_layout() -> dict[str, Any]:
         "font": {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK},
         "paper_bgcolor": "white",
         "plot_bgcolor": "white",
-        "margin": {"l": 56, "r": 14, "t": 48, "b": 44},
+        "margin": {"l": 66, "r": 14, "t": 48, "b": 44},
         "hoverlabel": {"font": {"size": 12}},
     }
 
@@ -169,7 +169,7 @@ def _phase_marks(phases: Sequence[Phase], ends: Sequence[float]) -> tuple[list[A
             annotations.append(
                 {
                     **{"text": phase.name, "hovertext": f"{phase.name}: {phase.reason}", "showarrow": False},
-                    **{"x": phase.to_s, "xanchor": "right", "y": 1, "yref": "paper", "yanchor": "bottom"},
+                    **{"x": phase.to_s, "xanchor": "right", "y": 1, "yref": "paper", "yanchor": "top"},
                     "font": {"size": 11, "color": "#667085"},
                 }
             )

@@ -18,6 +18,8 @@ _SLOW_M_S: Final = 0.1
 """Below this the path has no direction worth drawing."""
 _BAND_COLOURS: Final = ("#dbe7f3", "#c9dff0")
 _ALARM: Final = "#d9580d"
+ROW_GAP: Final = 0.5
+"""Share of a band's row that is left free for its name."""
 _GAP_S: Final = 0.05
 """Two spells of a limit closer together than this are drawn as one."""
 
@@ -44,11 +46,25 @@ def events(flight: FlightData) -> dict[str, Any]:
         data[-1] |= {"text": [phase.name], "textposition": "inside", "insidetextanchor": "middle"}
     data += [bar(text, spells, _ALARM, text) for text, spells in bands]
     layout = _layout(flight, [""])
-    layout |= {"barmode": "overlay", "showlegend": False, "hovermode": "closest", "bargap": 0.35}
     names = [text for text, _ in reversed(bands)] + ["phase"]
-    layout["yaxis"] |= {"type": "category", "categoryorder": "array", "categoryarray": names, "ticks": ""}
-    layout["margin"] = layout["margin"] | {"t": 14}
+    name_rows(layout, names)
     return {"data": data, "layout": layout}
+
+
+def name_rows(layout: dict[str, Any], names: Sequence[str]) -> None:
+    """Write the names of bands, from below, over the bands: beside them they would move the time axis."""
+    layout["yaxis"] |= {"type": "category", "categoryorder": "array", "categoryarray": list(names), "ticks": ""}
+    layout["yaxis"] |= {"showticklabels": False, "showgrid": False}
+    layout["annotations"] = [  # on an axis of categories a number is a place among them
+        {
+            **{"text": name, "showarrow": False, "xref": "paper", "x": 0.0, "xanchor": "left"},
+            **{"yref": "y", "y": index + 0.5 * (1.0 - ROW_GAP), "yanchor": "bottom", "borderpad": 0},
+            "font": {"size": 11, "color": "#667085"},
+        }
+        for index, name in enumerate(names)
+    ]
+    layout |= {"barmode": "overlay", "showlegend": False, "hovermode": "closest", "bargap": ROW_GAP}
+    layout["margin"] = layout["margin"] | {"t": 20}
 
 
 def _spells(time_s: Array, active: npt.NDArray[np.bool_]) -> list[tuple[float, float]]:

@@ -104,6 +104,7 @@ const touch = window.matchMedia("(pointer: coarse)").matches;
 const config = { responsive: true, displaylogo: false, modeBarButtons: [["resetScale2d", "toImage"]],
   displayModeBar: window.matchMedia("(hover: hover)").matches ? "hover" : false };
 const linked = figures.filter(figure => figure.layout.meta === "time").map(figure => figure.key);
+const drawn = new Set();
 let following = false;
 // Zooming one time axis zooms all of them: what happened at the same time stands below one another.
 function follow(source, change) {
@@ -112,27 +113,45 @@ function follow(source, change) {
   const whole = change["xaxis.autorange"] === true || change["autosize"] === true;
   if (!whole && (range[0] === undefined || range[1] === undefined)) { return; }
   following = true;
-  const others = linked.filter(key => key !== source).map(key => {
-    const home = document.getElementById(key).dataset;
-    const wanted = whole ? [Number(home.from), Number(home.to)] : [...range];
-    return Plotly.relayout(key, { "xaxis.range": wanted });
+  const others = figures.filter(figure => linked.includes(figure.key) && figure.key !== source).map(figure => {
+    const wanted = whole ? [...figure.home] : [...range];
+    if (drawn.has(figure)) { return Plotly.relayout(figure.key, { "xaxis.range": wanted }); }
+    figure.layout.xaxis.range = wanted;
   });
   Promise.all(others).finally(() => { following = false; });
 }
-for (const figure of figures) {
+function draw(figure) {
+  if (drawn.has(figure)) { return; }
+  drawn.add(figure);
   // On a touch screen a finger on a figure scrolls the page.
   figure.layout.dragmode = touch ? false : "zoom";
   const element = document.getElementById(figure.key);
-  if (linked.includes(figure.key)) {
-    [element.dataset.from, element.dataset.to] = figure.layout.xaxis.range;
-  }
   Plotly.newPlot(element, figure.data, figure.layout, config);
   if (linked.includes(figure.key)) {
     element.on("plotly_relayout", change => follow(figure.key, change));
   }
 }
+for (const figure of figures) {
+  if (linked.includes(figure.key)) { figure.home = [...figure.layout.xaxis.range]; }
+}
+// What is on the screen, or nearly, is drawn first; the page can be read meanwhile.
+const near = new IntersectionObserver(entries => entries.filter(entry => entry.isIntersecting).forEach(entry => {
+  near.unobserve(entry.target);
+  draw(figures.find(figure => figure.key === entry.target.id));
+}), { rootMargin: "300px" });
+figures.forEach(figure => near.observe(document.getElementById(figure.key)));
+window.everythingDrawn = new Promise(done => {
+  function next() {
+    const figure = figures.find(figure => !drawn.has(figure));
+    if (figure === undefined) { done(figures.length); return; }
+    draw(figure);
+    setTimeout(next, 30);
+  }
+  setTimeout(next, 400);
+});
 // Figures do not follow the paper by themselves. A page is 660 pixels wide and holds two figures of this height.
 window.addEventListener("beforeprint", () => {
+  figures.forEach(draw);
   for (const figure of figures) {
     const plot = document.getElementById(figure.key);
     const height = Math.min(plot.clientHeight, 370);

@@ -12,7 +12,7 @@ import numpy as np
 from companion.errors import InputError
 from companion.record.alignment import Fit
 from companion.record.charts import AXES, BAND, ERRORS, INK, Array, lines, time_layout
-from companion.record.figures_vehicle import bar, turned
+from companion.record.figures_vehicle import bar, name_rows, turned
 from companion.record.flight_data import FlightData
 from companion.record.flight_source import read_source
 from companion.record.folder import write_whole
@@ -62,7 +62,7 @@ def build_overlay(log: Path, flown: Path, out: Path | None = None) -> Overlay:
     sure = fit.clear and fit.same_flight
     parts = {
         "TITLE": f"{html.escape(flight_name(configuration, flown))}, with the autopilot's own log",
-        "SUBTITLE": f"{html.escape(log.name)} moved by <b>{fit.offset_s:+.4f} s</b> onto the companion's clock",
+        "SUBTITLE": f"{html.escape(log.name)} moved by <b>{fit.offset_s + 0.0:+.4f} s</b> onto the companion's clock",
         "VERDICT": "one flight" if sure else "ambiguous offset" if fit.same_flight else "perhaps another flight",
         "VERDICT_CLASS": "passed" if sure else "missed",
         "THRESHOLDS": notes(missing) + f"<p>Time offset {html.escape(fit.sentence)}.</p>",
@@ -78,7 +78,7 @@ def build_overlay(log: Path, flown: Path, out: Path | None = None) -> Overlay:
 
 
 def _tiles(fit: Fit, delay_s: float | None) -> str:
-    offset = ", ".join(f"{100.0 * x:.1f}" for x in fit.position_offset_m)
+    offset = ", ".join(f"{round(100.0 * x, 1) + 0.0:.1f}" for x in fit.position_offset_m)
     return "".join(
         tile(*map(html.escape, entry))
         for entry in (
@@ -232,10 +232,7 @@ def _modes(flight: FlightData, px4: Px4Log) -> dict[str, Any] | None:
             data.append(bar("PX4", [span], "#dcefe6" if index % 2 else "#c5e3d5", name))
             data[-1] |= {"text": [name], "textposition": "inside", "insidetextanchor": "middle"}
     layout = _layout(flight, [""])
-    layout |= {"barmode": "overlay", "showlegend": False, "hovermode": "closest", "bargap": 0.35}
-    order = {"type": "category", "categoryorder": "array", "categoryarray": ["PX4", "companion"], "ticks": ""}
-    layout["yaxis"] |= order
-    layout["margin"] = layout["margin"] | {"t": 14}
+    name_rows(layout, ["PX4", "companion"])
     return {"data": data, "layout": layout}
 
 

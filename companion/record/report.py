@@ -219,8 +219,8 @@ def _tiles(summary: Mapping[str, Any]) -> str:
         ("Lost setpoints", f"{summary.get('lost_setpoints', 0)}", "states that got no answer"),
     ]
     if not _by_law(summary):
-        tiles = [tile for tile in tiles if tile[0] not in {"Disturbance", "Thrust"}]
-    return "".join(tile(*map(html.escape, tile)) for tile in tiles)
+        tiles = [entry for entry in tiles if entry[0] not in {"Disturbance", "Thrust"}]
+    return "".join(tile(*map(html.escape, entry)) for entry in tiles)
 
 
 def tile(label: str, value: str, note: str) -> str:

@@ -24,8 +24,9 @@ from companion.ground.client import Client
 
 PATIENCE_S = 60.0
 LONG_HOVER = dict(HOVER) | {"duration_s": 200.0}
-LONG_CIRCLE = read_toml(find("circle", "trajectories")) | {"laps": 50}
-TRAJECTORIES: dict[str, dict[str, Any]] = {"circle": LONG_CIRCLE, "hover": LONG_HOVER}
+LONG_CIRCLE = read_toml(find("circle", "trajectories")) | {"laps": 8}
+SHORT_HOVER = dict(HOVER) | {"duration_s": 15.0}
+TRAJECTORIES: dict[str, dict[str, Any]] = {"circle": LONG_CIRCLE, "hover": LONG_HOVER, "short": SHORT_HOVER}
 
 
 def until(condition: Callable[[], object], what: str = "") -> None:
@@ -38,15 +39,17 @@ def until(condition: Callable[[], object], what: str = "") -> None:
 class Serving:
     """One `companion serve`; use it as a context manager."""
 
-    def __init__(self, folder: Path, vehicle_port: int, *options: str) -> None:
+    def __init__(
+        self, folder: Path, vehicle_port: int, names: tuple[str, ...] = ("circle", "hover"), *options: str
+    ) -> None:
         self.folder = folder
         self.port = free_udp_port()
         self.to = f"udpout:127.0.0.1:{self.port}"
         self.lines: list[str] = []
         trajectories = folder / "trajectories"
         trajectories.mkdir(parents=True, exist_ok=True)
-        for name, data in TRAJECTORIES.items():
-            text = tomlkit.dumps({key: value for key, value in data.items() if key != "name"})
+        for name in names:
+            text = tomlkit.dumps({key: value for key, value in TRAJECTORIES[name].items() if key != "name"})
             (trajectories / f"{name}.toml").write_text(text)
         vehicle = folder / "serve_vehicle.toml"
         vehicle.write_text(tomlkit.dumps(make_flight().vehicle.model_dump(mode="json", exclude_none=True)))
@@ -167,6 +170,12 @@ class PlainTool:
                 assert {(ack.target_system, ack.target_component) for ack in acks} == {(255, 190)}
                 return [ack.result for ack in acks]
         raise AssertionError(f"command {command} was not answered")
+
+    def phase(self) -> int | None:
+        """Of the companion's heartbeats since the last command, after listening a little."""
+        self.receive(0.05)
+        codes = [m.custom_mode & 0xFF for m in self.heard if m.get_type() == "HEARTBEAT"]
+        return codes[-1] if codes else None
 
     def said(self) -> str:
         """All texts so far."""

@@ -20,6 +20,7 @@ from serve_cases import PlainTool, Serving, serving, until
 
 from companion.cli import main
 from companion.errors import InputError, RefusedError
+from companion.ground.standing import PHASE_CODES
 from sim_link.modes import Mode
 
 README = Path(__file__).parents[2] / "README.md"
@@ -30,7 +31,7 @@ ACCEPTED, REJECTED, DENIED, UNSUPPORTED, UNDER_WAY = 0, 1, 2, 3, 5
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Serving, Stand]]:
     """One companion for all tests here: it is a long-running program."""
-    with serving(tmp_path_factory.mktemp("serve")) as (serve, stand):
+    with serving(tmp_path_factory.mktemp("serve"), start=((0.0, 0.0, -6.0), 0.0)) as (serve, stand):
         with serve.client():
             pass
         yield serve, stand
@@ -99,9 +100,7 @@ def test_plain_pymavlink(both: tuple[Serving, Stand], whole: bool) -> None:
         assert results[-1] == ACCEPTED
         assert set(results[:-1]) == {UNDER_WAY}
         tool.command(START, 2.0, confirmation=1)  # a repetition starts nothing
-        until(lambda: stand.mode is Mode.OFFBOARD)
-        tool.heard.clear()
-        until(lambda: tool.receive(0.05) or "track:" in tool.said())  # type: ignore[func-returns-value]
+        until(lambda: tool.phase() == PHASE_CODES["track"])
         assert tool.command(PAUSE_CONTINUE, 0.0, whole=whole)[-1] == ACCEPTED
         assert tool.command(PAUSE_CONTINUE, 1.0, whole=whole)[-1] == ACCEPTED
         tool.receive(1.2)
@@ -156,7 +155,7 @@ def test_ground_process_killed_in_flight(both: tuple[Serving, Stand]) -> None:
     """Nothing changes in the flight, and the next one takes its place."""
     serve, stand = both
     with serve.client() as client:
-        client.start("circle")
+        client.start("hover")
         client.wait_for("track")
     before, control_pid = serve.ground_pid, serve.control_pid
     flights = len(serve.summaries())
@@ -165,7 +164,7 @@ def test_ground_process_killed_in_flight(both: tuple[Serving, Stand]) -> None:
     until(lambda: serve.ground_pid not in {None, before})
     with serve.client() as client:
         now = client.wait_for("track")
-        assert (now.trajectory_id, now.vehicle) == (1, True)
+        assert (now.trajectory_id, now.vehicle) == (2, True)
         client.pause()
         client.resume()
         client.stop()
@@ -201,6 +200,8 @@ def test_control_process_killed_in_flight(both: tuple[Serving, Stand]) -> None:
         client.wait_for("track")
         assert stand.mode is Mode.OFFBOARD
         client.stop()
+        client.land()  # without a flight
+        assert stand.mode is Mode.LAND
     assert "the control process was ended by signal 9; it is started again" in serve.log
 
 

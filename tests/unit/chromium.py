@@ -9,6 +9,7 @@ import select
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -22,6 +23,14 @@ FLAGS = (
     *("--disable-extensions", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--disable-default-apps", "--metrics-recording-only", "--mute-audio"),
 )
+START = """
+import fcntl, os, sys
+into, out = (fcntl.fcntl(int(number), fcntl.F_DUPFD, 10) for number in sys.argv[1:3])
+os.dup2(into, 3)
+os.dup2(out, 4)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
+"""The browser reads requests from descriptor 3 and answers on 4."""
 
 
 def installed() -> str | None:
@@ -44,7 +53,7 @@ class Chromium:
         sandbox = ["--no-sandbox"] if os.geteuid() == 0 else []
         command = [program, *FLAGS, *sandbox, f"--user-data-dir={self._profile.name}", "about:blank"]
         self._process = subprocess.Popen(
-            ["/bin/sh", "-c", f'exec "$0" "$@" 3<&{into} 4>&{out}', *command],
+            [sys.executable, "-S", "-c", START, str(into), str(out), *command],
             pass_fds=(into, out),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

@@ -14,9 +14,10 @@ from companion.config import Acceptance, build_flight, load_vehicle
 from companion.control import flat
 from companion.control.types import State
 from companion.control.vectors import quat_normalise
-from companion.errors import InputError
+from companion.errors import InputError, RefusedError
 from companion.flight.course import Course, at_rest
 from companion.flight.phases import Engagement
+from companion.flight.preflight import gate_gains
 from companion.flight.retuning import POINTS, ParameterChange, Retuning, Transition, between, flown, points, unsound
 from companion.flight.tracker import Tracker, kernels
 from companion.trajectory.load import load, of_flight
@@ -301,3 +302,26 @@ def test_a_flight_with_a_change_in_the_middle_stays_as_close_to_its_path(change,
     assert made[0].parameters.gains == changed(flight.vehicle, **change).gains
     assert retuned_error < 1.2 * error + 0.005
     assert all(retuned_steps < 1.5 * steps + 0.01)
+
+
+# -- the gates, in brief ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {}, {"controller": {"k4_1_s": 60.0}}, {"controller": {"k1_1_s": 4.0}}, {"limits": {"state_gap_max_s": 0.13}},
+        {"controller": {"k4_1_s": 14.0}, "limits": {"state_gap_max_s": 0.02}}, {"link": {"state_rate_hz": 20.0}},
+        {"controller": {"prediction": False}}, {"limits": {"state_gap_max_s": 0.104}},
+    ],
+)  # fmt: skip
+def test_the_gates_in_brief_give_the_same_verdict(changes):
+    def verdict(brief):
+        try:
+            gate_gains(vehicle, brief=brief)
+        except RefusedError as error:
+            return str(error)
+        return ""
+
+    vehicle = load_vehicle("bundled", changes)
+    assert verdict(True) == verdict(False)

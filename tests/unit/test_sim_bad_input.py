@@ -367,6 +367,15 @@ def test_an_endless_flood_does_not_hold_the_clock_in_lockstep(monkeypatch: pytes
         assert v.t_us == before_us + v.period_us
 
 
+def test_of_too_many_texts_a_few_are_sent() -> None:
+    v = vehicle()
+    v.autopilot.texts.extend((2, f"text {k}") for k in range(100))
+    v.tick()
+    sent = [frames(raw)[0].msg_id for raw in v.companion.outbox].count(mavlink.MAVLINK_MSG_ID_STATUSTEXT)
+    assert 1 <= sent <= 10
+    assert not v.autopilot.texts
+
+
 def test_what_a_state_is_allowed() -> None:
     assert allowance(0.004) == 20
     assert allowance(0.01, 20) == allowance(1e-6) == ALLOWANCE_LEAST

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -191,16 +192,28 @@ def test_before_px4_gives_controls_the_world_runs_at_real_time() -> None:
 
 
 def test_a_silent_px4_is_waited_for_a_bounded_time_and_taken_back() -> None:
-    with flying(patience_s=0.05) as (world, px4):
-        px4.fly(5)
+    with flying(patience_s=0.1) as (world, px4):
+        got = sensors(px4.fly(5))
+        lost = world.hil.misses
         for _ in range(10):
-            px4.sample()  # says nothing
-        assert world.hil.misses == 1 and not world.hil.synchronous
-        assert any("no controls from PX4 for 0.05 s" in s for s in world.said)
-        got = sensors(px4.fly(20))
+            got += sensors(px4.sample())  # says nothing
+        assert world.hil.misses == lost + 1, "once it is missed it is not waited for any more"
+        assert not world.hil.synchronous
+        assert any("no controls from PX4 for 0.1 s" in s for s in world.said)
+        got += sensors(px4.fly(20))
+        assert sum("in lockstep" in s for s in world.said) >= 2, "taken back"
         assert {b.time_usec - a.time_usec for a, b in pairwise(got)} == {4000}
-        assert world.hil.synchronous
-        assert sum("in lockstep" in s for s in world.said) == 2
+
+
+def test_a_px4_slower_than_real_time_gets_lockstep_too() -> None:
+    with flying() as (world, px4):
+        for _ in range(10):
+            px4.sample()
+            time.sleep(0.01)  # more than a sample's time
+            px4.answer()
+        while not px4.silent_for(0.05):
+            px4.sample()
+        assert world.hil.synchronous and world.hil.misses == 0, "it stands still until the newest sample is answered"
 
 
 def test_a_px4_that_leaves_ends_the_world_and_the_next_one_finds_it_at_its_start() -> None:

@@ -1,0 +1,82 @@
+"""What `companion serve` and its client say when something is not as it should be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+from flight_cases import Stand, make_flight
+from serve_cases import Serving, until
+
+from companion import Client
+from companion.cli import main
+from companion.errors import LinkError
+from companion.flight.bundled import free_udp_port
+
+
+def test_nobody_answers() -> None:
+    port = free_udp_port()
+    with pytest.raises(
+        LinkError, match=rf"no companion answers at udpout:127.0.0.1:{port} within 0.2 s: is `companion"
+    ):
+        Client(f"udpout:127.0.0.1:{port}", 0.2)
+    assert main(["pause", "--to", f"udpout:127.0.0.1:{port}", "--timeout", "0.1"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--vehicle", "nonesuch"], "no vehicle file 'nonesuch'"),
+        (["--vehicle", "paper", "--connect", "tcp:1"], 'connection "tcp:1"'),
+        (["--vehicle", "paper", "--ground", "udpin:127.0.0.1:0"], "port 0 is not within"),
+        (["--vehicle", "paper", "--flights", "/proc/nothing"], "--flights /proc/nothing: cannot be made"),
+    ],
+)
+def test_wrong_options(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["serve", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("link", ["--connect", "--ground"])
+def test_a_port_in_use_ends_it_at_once(
+    link: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Starting a process again that could never begin would help nobody."""
+    monkeypatch.chdir(tmp_path)
+    other = "--ground" if link == "--connect" else "--connect"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        held = f"udpin:127.0.0.1:{holder.getsockname()[1]}"
+        free = f"udpin:127.0.0.1:{free_udp_port()}"
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+        try:
+            assert main(["serve", "--vehicle", "paper", "--engine", "python", link, held, other, free]) == 4
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    assert "is in use (process " in capfd.readouterr().err
+
+
+def test_the_supervisor_killed(tmp_path: Path) -> None:
+    """The flight goes on to its end; then nothing is left."""
+    with Stand(make_flight(), tmp_path) as stand, Serving(tmp_path, stand.port, ("short",)) as serve:
+        with serve.client() as client:
+            client.start("short")
+            client.wait_for("track")
+        pids = (serve.control_pid, serve.ground_pid)
+        os.kill(serve.process.pid, signal.SIGKILL)
+        until(lambda: all(not Path(f"/proc/{pid}").exists() for pid in pids))
+        assert serve.summaries()[-1]["ended"] == "the flight was completed: the vehicle is in Hold"
+        assert not stand.vehicle.autopilot.in_failsafe
