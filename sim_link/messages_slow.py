@@ -249,7 +249,7 @@ class SlowTelemetry:
             health &= ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
         return mavlink.MAVLink_sys_status_message(
             present, present, health, 100, _whole(1000.0 * battery.voltage_v, 0, _UINT16_MAX - 1),
-            _whole(100.0 * battery.current_a, 0, 32767), 0, 0, 0, 0, 0, 0, round(100.0 * battery.remaining), 0, 0, 0,
+            _whole(100.0 * battery.current_a, 0, 32767), round(100.0 * battery.remaining), 0, 0, 0, 0, 0, 0, 0, 0, 0,
         )  # fmt: skip
 
     def battery_status(self) -> Any:

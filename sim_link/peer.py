@@ -238,6 +238,8 @@ class Peer:
             self._act(*self._waiting.popleft())
         give_up_s = self._ticked_s + PATIENCE_S
         self._spin_first()
+        if self._answered:
+            self._hear_ground()  # nobody has slept, and so nobody has looked there
         while not self._answered:
             left_s = give_up_s - time.monotonic()
             if left_s <= 0.0:

@@ -411,6 +411,7 @@ def _from_vehicle_file(file: VehicleFile, system: int) -> dict[str, int | float]
     """Give the parameters that whoever set this vehicle up would have set."""
     return {
         "MAV_SYS_ID": system,
+        "COM_OBL_RC_ACT": 5,  # Hold: PX4's own 0 needs a pilot with sticks
         "MPC_THR_HOVER": file.mass_kg * _STANDARD_G / (4.0 * file.rotor_thrust_max_n),
         "THR_MDL_FAC": file.curve_factor,
         "MC_ROLL_P": file.attitude_gain_1_s[0],

@@ -24,6 +24,7 @@ COMMANDS = {
     "fly": "Fly a trajectory on a vehicle that is already there.",
     "check": "Check that trajectories can be flown: continuity, limits, margins.",
     "mission": "Download the autopilot's mission and geofence into a file to plan through.",
+    "doctor": "Look at a connected vehicle: would a flight be refused, and why.",
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
     "upload": "Bring a trajectory to the vehicle and get its verdict.",

@@ -14,8 +14,9 @@ from companion.link.version import AutopilotVersion
 
 
 class Gate(StrEnum):
-    """The gates of the connected vehicle, in the order in which they are told."""
+    """The gates, in the order in which they are told; the first needs no vehicle."""
 
+    GAINS = "gains"
     PARAMETERS = "parameters"
     VERSION = "version"
     OUTPUT = "output"

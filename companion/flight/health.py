@@ -25,8 +25,8 @@ class SystemHealth(NamedTuple):
     """Whether manual control is live."""
     fence_kept: bool | None
     """Whether the vehicle is within the autopilot's fence; None: it does not say."""
-    can_arm: bool | None
-    """Whether it would arm in its present mode; None: it does not say."""
+    can_arm: bool
+    """Whether it would arm in its present mode."""
     battery: float | None
     """Share that is left in the emptiest battery; None: unknown."""
 
@@ -35,12 +35,11 @@ class SystemHealth(NamedTuple):
         """Reads pymavlink's message."""
         present, healthy = message.onboard_control_sensors_present, message.onboard_control_sensors_health
 
-        def state(bit: int) -> bool | None:
-            return bool(healthy & bit) if present & bit else None
-
+        fence_kept = bool(healthy & _GEOFENCE) if present & _GEOFENCE else None
         remaining = message.battery_remaining
         battery = 1e-2 * remaining if remaining >= 0 else None
-        return cls(bool(present & _RC_RECEIVER), state(_GEOFENCE), state(_PREARM_CHECK), battery)
+        # PX4 says of PREARM_CHECK that it is healthy, never that it is present.
+        return cls(bool(present & _RC_RECEIVER), fence_kept, bool(healthy & _PREARM_CHECK), battery)
 
 
 class EstimatorFlag(IntFlag):
@@ -85,13 +84,16 @@ class EstimatorHealth(NamedTuple):
             message.pos_horiz_accuracy,
         )
 
-    def lacking(self) -> list[str]:
-        """What a flight needs of the estimate and does not have, for people."""
+    def lacking(self, *, in_air: bool) -> list[str]:
+        """What a flight needs of the estimate and does not have, for people.
+
+        On the ground PX4's estimator may well go by the vehicle's being at rest.
+        """
         flags, names = self.flags, []
         for needed, name in _NEEDED:
             if not flags & needed:
                 names.append(f"no {name}")
-        if flags & EstimatorFlag.CONSTANT_POSITION_MODE:
+        if in_air and flags & EstimatorFlag.CONSTANT_POSITION_MODE:
             names.append("it only holds a constant position")
         if flags & EstimatorFlag.ACCELEROMETER_ERROR:
             names.append("bad accelerometer data")

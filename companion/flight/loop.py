@@ -29,7 +29,9 @@ from companion.flight.course import Course, at_rest
 from companion.flight.guards import Guards, coast_setpoint
 from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
+from companion.flight.measure import silence_limit_s
 from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
+from companion.flight.preflight import Preflight
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
 from companion.flight.retuning import ParameterChange, Retuning
 from companion.flight.rows import StepTiming, control_row
@@ -43,14 +45,11 @@ from companion.link.operations import STOP_MESSAGE, Operations
 from companion.link.setpoint import SetpointSender, UnsendableSetpoint
 from companion.link.telemetry import StateRejection, Telemetry, VehicleState
 from companion.link.timesync import PacedPeer
+from companion.link.version import AutopilotVersion
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.anchored import Trajectory
 
-SILENCE_MIN_S = 0.05
-"""A state may be late by three of its periods, and by this at least: at 250 Hz three periods are 12 ms, which a busy
-machine takes for itself now and then; the prediction bridges that, and PX4 holds the last rates no longer than this."""
-SILENT_PERIODS = 3.0
 PACED_SILENCE_S = 3.0
 """Wall time after which a vehicle in lockstep, whose clock stands still while it is silent, counts as lost."""
 LINK_SILENCE_S = 5.0
@@ -130,6 +129,7 @@ class FlightLoop:
         system: the vehicle's system id, where it is known already.
         host: the program around it.
         engaged: called when the controller takes over, and again after its course's pace was changed; must not block.
+        only_gates: nothing is flown: it ends when the gates have judged.
     """
 
     def __init__(
@@ -146,6 +146,7 @@ class FlightLoop:
         system: int | None = None,
         host: Host | None = None,
         engaged: Callable[[Engagement], None] = lambda engagement: None,
+        only_gates: bool = False,
     ) -> None:
         self._flight = flight
         self._trajectory = trajectory
@@ -158,11 +159,12 @@ class FlightLoop:
         self._system = system
         self._host: Host = Alone() if host is None else host
         self._engaged = engaged
+        self._only_gates = only_gates
         self._tracker = controller_of(flight, compiled)
         self._retuning = Retuning(self._tracker, notify) if isinstance(self._tracker, Tracker) else None
         self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
         self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
-        self._silence_s = max(SILENT_PERIODS * self._interval_s, SILENCE_MIN_S)
+        self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz)
         self._peer = PacedPeer()
         self._clock = VehicleClock(self._peer)
         self._autopilot = Autopilot()
@@ -219,6 +221,16 @@ class FlightLoop:
     def autopilot(self) -> Autopilot:
         """What the autopilot has said of itself."""
         return self._autopilot
+
+    @property
+    def preflight(self) -> Preflight | None:
+        """What the gates found; None while no autopilot was heard."""
+        return self._sequence.preflight if self._met else None
+
+    @property
+    def version(self) -> AutopilotVersion | None:
+        """The autopilot's, once it has told."""
+        return self._ops.version if self._met else None
 
     def run(self) -> Outcome:
         """Flies. Returns how it ended; never raises for anything that the vehicle, the link or the law does."""
@@ -285,7 +297,8 @@ class FlightLoop:
         self._ops = Operations(self._wire.send, system)
         self._sender = SetpointSender(self._wire.send, system)
         self._sequence = Sequence(
-            self._flight, self._trajectory, self._ops, self._autopilot, self._engage, self._notify
+            *(self._flight, self._trajectory, self._ops, self._autopilot, self._engage, self._notify),
+            only_gates=self._only_gates,
         )
         self._met = True
 
@@ -368,6 +381,7 @@ class FlightLoop:
         if isinstance(state, StateRejection):
             if state is StateRejection.REBOOTED:
                 raise FlightEnded(Cause.REBOOTED, state.sentence)
+            self._sequence.preflight.meter.on_rejection(state)
             if self._telemetry.rejected[state] == 1:
                 self._notify(f"a state was not used: {state.sentence}")
             return
@@ -377,17 +391,22 @@ class FlightLoop:
         self._pending_wall_ns = frame.arrival_wall_ns
         self._peer.on_state(state.t_vehicle_us)
         self._clock.on_state(state.t_vehicle_us, frame.arrival_wall_ns)
+        meter = self._sequence.preflight.meter
+        if meter.running:
+            meter.on_state(state, self._clock.now_s(frame.arrival_wall_ns), paced=self._peer.paced)
 
     def _on_timesync(self, frame: Frame) -> None:
         """A request is answered after the setpoint for the state that came before it."""
         message = codec.decode_timesync(frame.payload)
         if not timesync.is_request(message, self._wire.system_id, self._wire.component_id):
+            self._on_time_told(message, frame.arrival_wall_ns)
             return
         self._peer.on_request(message.ts1)
         self._clock.on_timesync(message.ts1, frame.arrival_wall_ns)
         self._requests.append((message, frame))
         if self._peer.paced:
             self._timesync_at_ns = message.ts1
+            self._sequence.preflight.meter.on_paced_request(message.ts1)
             self._wire.gather()
             try:
                 self._answer_state()
@@ -398,6 +417,11 @@ class FlightLoop:
             self._sent_ns = time.monotonic_ns()
             self._account()
             self._tick()
+
+    def _on_time_told(self, message: Timesync, wall_ns: int) -> None:
+        """An answer to a request of ours."""
+        if timesync.is_response(message, self._wire.system_id, self._wire.component_id):
+            self._sequence.preflight.meter.on_answer(message, self._clock.now_s(wall_ns))
 
     def _answer_requests(self) -> None:
         wire = self._wire

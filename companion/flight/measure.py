@@ -53,7 +53,7 @@ class LinkFigures(NamedTuple):
     round_trip_s: float | None = None
     """Median."""
     clock_error_s: float | None = None
-    """The vehicle's time by its answers to us, less by its own requests; of the answer with the shortest round trip."""
+    """The vehicle's time by its answers to us, less by its own requests: median of the half with the shorter trips."""
     paced: bool = False
     """In lockstep."""
 
@@ -132,10 +132,11 @@ class LinkMeter:
             rejected=rejected, rejections=sum(self._rejected.values()), resets=self._resets, paced=self._paced
         )
         if self._answers:
-            trips = sorted(answer.round_trip_ns for answer in self._answers)
-            best = min(self._answers, key=lambda answer: answer.round_trip_ns)
+            answers = sorted(self._answers, key=lambda answer: answer.round_trip_ns)
+            middle = answers[len(answers) // 2]
+            offsets = sorted(answer.offset_ns for answer in answers[: len(answers) // 2 + 1])
             found = found._replace(
-                round_trip_s=trips[len(trips) // 2] * 1e-9, clock_error_s=best.offset_ns * 1e-9
+                round_trip_s=middle.round_trip_ns * 1e-9, clock_error_s=offsets[len(offsets) // 2] * 1e-9
             )
         return self._of_states(found, now_s)
 

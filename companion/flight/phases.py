@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from companion.control.types import Quat, Vec3
 from companion.errors import ExitCode
+from companion.flight.health import EstimatorHealth, SystemHealth
 from companion.flight.retuning import Transition
 from companion.flight.tempo import Ramp
 from companion.frames import GeoPoint
@@ -45,6 +46,7 @@ class Cause(Enum):
     """Why a flight ended."""
 
     COMPLETED = Ending("the flight was completed", ExitCode.DONE)
+    INSPECTED = Ending("a flight would not be refused", ExitCode.DONE)
     INTERRUPTED = Ending("interrupted by the operator", ExitCode.INTERRUPTED)
     STOPPED = Ending("stopped by the operator", ExitCode.DONE)
     REFUSED = Ending("refused by a gate", ExitCode.REFUSED)
@@ -112,6 +114,12 @@ class Autopilot:
     hold_thrust: float | None = None
     """Thrust setpoint while the autopilot itself held the vehicle, smoothed (0 to 1)."""
     parameters: dict[str, float] = field(default_factory=dict)
+    system_status: int | None = None
+    """MAV_STATE, of HEARTBEAT; None before the first."""
+    health: SystemHealth | None = None
+    """As SYS_STATUS told it last."""
+    estimator: EstimatorHealth | None = None
+    """As ESTIMATOR_STATUS told it last."""
 
 
 @dataclass(frozen=True)

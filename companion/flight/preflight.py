@@ -1,38 +1,60 @@
-"""The gates between connecting and flying: what must hold before anything moves, each with its figure and what to do.
+"""What must hold before anything moves.
 
-Offline gates (`gates_before_connecting`) need only the files: certificate, delay margin, the reference within its
-limits. `Preflight` asks the connected autopilot for its version, its parameters and the message rates that the flight
-needs, and measures the state rate.
+The first gates need only the files: certificate, delay margin, the reference within its limits. `Preflight` asks the
+connected autopilot for its version, its parameters and the message rates that the flight needs, measures the link, and
+lets the gates of `flight.gates` judge.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 from companion.config import Flight, Vehicle
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S, Margins, Timing, margins
 from companion.errors import RefusedError
+from companion.flight import gates_state
+from companion.flight.findings import Finding, Gate, Measured, Verdict, passed, refusal, refused
+from companion.flight.gates import DOWN, judge
+from companion.flight.gates_setup import NEEDED
+from companion.flight.health import ESTIMATOR_STATUS, SYS_STATUS
 from companion.flight.inspection import reference_problems
-from companion.flight.phases import Autopilot, Cause, FlightEnded
+from companion.flight.measure import LinkMeter, silence_limit_s
+from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState
+from companion.flight.silence import Silence, when_silent
 from companion.flight.surroundings import Problem, place_problems
 from companion.link import codec
-from companion.link.operations import Operation, Operations
+from companion.link.operations import Operation, Operations, Retry
 from companion.link.telemetry import VehicleState
 from companion.trajectory.anchored import Trajectory, anchored
 
-DELAY_MARGIN_MIN_S = 0.010
-RATE_FLOOR = 0.8
-"""Share of the vehicle file's state rate below which a flight is refused."""
+DELAY_MARGIN_MIN_S = gates_state.DELAY_MARGIN_MIN_S
 MEASURE_S = 1.0
 ASK_FASTER = 0.8
 """Asking for exactly the source's period loses messages: ask for a shorter interval."""
 REQUEST_TIMEOUT_S = 8.0
 FIRST_STATE_TIMEOUT_S = 5.0
+REPORT_TIMEOUT_S = 2.5
+"""Reports that do not come within this time after asking are judged as missing."""
+ASK_TIME_INTERVAL_S = 0.05
+WORDS_WAIT_S = 0.3
+"""What the autopilot says against arming may come after its answer."""
+OPTIONAL_RETRY = Retry(0.25, 3)
+"""An autopilot may not have a parameter, and older ones then say nothing."""
 
-PARAMETERS = ("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE", "THR_MDL_FAC")
-NEEDED = ("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE")
-"""What the gates and the loop's own silence go by."""
+PARAMETERS = (
+    *("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_RCL_ACT", "MAV_TYPE", "THR_MDL_FAC"),
+    *("MAV_FWDEXTSP", "NAV_DLL_ACT", "COM_RCL_EXCEPT", "COM_DLL_EXCEPT", "COM_RC_IN_MODE", "COM_RC_LOSS_T"),
+    *("COM_FAIL_ACT_T", "MAN_OVERRIDE_SPD", "COM_RC_OVERRIDE", "COM_LOW_BAT_ACT", "COM_QC_ACT", "BAT_LOW_THR"),
+    *("COM_DISARM_PRFLT", "COM_DISARM_LAND", "COM_SPOOLUP_TIME", "COM_POS_FS_ACT", "COM_POS_FS_EPH"),
+    *("COM_VEL_FS_EVH", "COM_ARM_WO_GPS", "COM_ARMABLE", "COM_FLTMODE_BOOT", "GF_ACTION", "GF_SOURCE"),
+    *("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST", "RTL_RETURN_ALT", "FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI"),
+    *("FD_FAIL_P_TTRI", "FD_ALT_LOSS", "CBRK_FLIGHTTERM", "CBRK_SUPPLY_CHK", "MC_ROLLRATE_MAX"),
+    *("MC_PITCHRATE_MAX", "MC_YAWRATE_MAX", "MC_REF_W_N", "MC_REF_FF", "MC_AIRMODE", "MC_BAT_SCALE_EN"),
+    *("MPC_THR_HOVER", "MPC_TILTMAX_AIR", "IMU_GYRO_CUTOFF", "IMU_DGYRO_CUTOFF", "EKF2_HGT_REF", "SYS_FAILURE_EN"),
+)
+"""What a flight depends on; the log keeps them all. Those of `gates_setup.NEEDED` come first and are a must."""
 BASELINE_PARAMETERS = (
     *("MPC_XY_P", "MPC_Z_P", "MPC_XY_VEL_P_ACC", "MPC_XY_VEL_I_ACC", "MPC_XY_VEL_D_ACC"),
     *("MPC_Z_VEL_P_ACC", "MPC_Z_VEL_I_ACC", "MPC_Z_VEL_D_ACC", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP"),
@@ -41,18 +63,14 @@ BASELINE_PARAMETERS = (
 """Beside those, where PX4's own position controller flies: what its tracking goes by. For the summary; none is a
 must."""
 
-_STICK_ACTIONS = (0.0, 1.0, 2.0)
-"""COM_OBL_RC_ACT: Position, Altitude, Stabilized; without sticks NAV_RCL_ACT acts instead."""
-_NO_ACTIONS = (0.0, 7.0)
-"""NAV_RCL_ACT: disabled, and "Hold, no failsafe"."""
-
 CURRENT_MODE = 436
 EXTENDED_SYS_STATE = 245
 HOME_POSITION = 242
 ATTITUDE_TARGET = 83
 
-MESSAGE_RATES_HZ = {CURRENT_MODE: 10.0, EXTENDED_SYS_STATE: 5.0}
+MESSAGE_RATES_HZ = {CURRENT_MODE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 5.0, ESTIMATOR_STATUS: 5.0}
 """Beside ODOMETRY, which is asked for at the vehicle file's rate."""
+RUN_PREARM_CHECKS = 401
 
 
 def timing(vehicle: Vehicle) -> Timing:
@@ -108,6 +126,17 @@ def gate_gains(vehicle: Vehicle, *, allow_uncertified: bool = False, brief: bool
     return found
 
 
+def gains_finding(vehicle: Vehicle) -> Finding:
+    """`gate_gains` as a line of the table of gates."""
+    limit = f"certified, {DELAY_MARGIN_MIN_S * 1e3:g} ms of delay margin"
+    try:
+        found = gate_gains(vehicle)
+    except RefusedError as error:
+        return refused(Gate.GAINS, "refused", limit, str(error), "")
+    shown = f"{found.delay_margin_s * 1e3:.1f} ms"
+    return passed(Gate.GAINS, shown, limit, f"the gains are certified, with a delay margin of {shown}")
+
+
 def gate_reference(trajectory: Trajectory, vehicle: Vehicle) -> None:
     """The trajectory is smooth and keeps the vehicle's limits; where it is anchored does not matter.
 
@@ -137,23 +166,35 @@ def _refuse(trajectory: Trajectory, problems: Sequence[Problem]) -> None:
 
 
 class Preflight:
-    """What is asked of and measured on the connected autopilot; PREFLIGHT lasts until `done`."""
+    """What is asked of and measured on the connected autopilot; PREFLIGHT lasts until `done`.
 
-    def __init__(self, flight: Flight, operations: Operations, autopilot: Autopilot) -> None:
+    Nothing is changed on the vehicle but the intervals of messages on this link.
+
+    Args:
+        flight: what is to be flown.
+        operations: requests to the autopilot.
+        autopilot: what it says of itself; gets the parameters that are read.
+        notify: called with lines for people: warnings, and what happens when this program falls silent.
+    """
+
+    def __init__(
+        self, flight: Flight, operations: Operations, autopilot: Autopilot, notify: Callable[[str], None]
+    ) -> None:
         self._flight = flight
         self._ops = operations
         self._autopilot = autopilot
+        self._notify = notify
+        self.meter = LinkMeter(silence_limit_s(flight.vehicle.link.state_rate_hz))
+        """Measures the link; the loop tells it what comes."""
+        self.findings: list[Finding] = []
+        """Of all gates, once they have judged."""
         self._begun_s: float | None = None
-        self._pending: list[Operation] = []
+        self._measuring_from_s = 0.0
+        self._asked_time_s = -math.inf
+        self._rate: Operation | None = None
+        self._version: Operation | None = None
         self._reads: dict[str, Operation] = {}
-        self._first_s: float | None = None
-        self._states = 0
-        self._measuring_from_s: float | None = None
-
-    def on_state(self, state: VehicleState) -> None:
-        """Counts states once the rates have been asked for."""
-        if self._measuring_from_s is not None:
-            self._states += 1
+        self._words: Operation | None = None
 
     def done(self, now_s: float) -> bool:
         """Goes on asking; True when everything is known and fine.
@@ -164,26 +205,11 @@ class Preflight:
         if self._begun_s is None:
             self._begun_s = now_s
             self._ask(now_s)
-        if any(operation.pending for operation in self._pending):
-            if now_s - self._begun_s > REQUEST_TIMEOUT_S:
-                waiting = ", ".join(o.what for o in self._pending if o.pending)
-                raise FlightEnded(Cause.REFUSED, f"the autopilot did not answer: {waiting}")
+        self._ask_time(now_s)
+        if not self._known(now_s, self._begun_s) or not self._explained(now_s):
             return False
-        if self._measuring_from_s is None:
-            self._measuring_from_s = now_s
-            self._gate_answers()
-        if self._first_s is None:
-            if self._states > 0:
-                self._first_s, self._states = now_s, 0
-            elif now_s - self._measuring_from_s > FIRST_STATE_TIMEOUT_S:
-                raise FlightEnded(
-                    Cause.REFUSED,
-                    "no usable ODOMETRY within 5 s: the estimator is not ready, or the link does not carry it",
-                )
-            return False
-        if now_s - self._first_s < MEASURE_S:
-            return False
-        self._gate_rate(self._states / (now_s - self._first_s))
+        self.meter.running = False
+        self._judge(now_s)
         return True
 
     def takeoff_amsl_m(self, state: VehicleState | None) -> float | None:
@@ -199,61 +225,95 @@ class Preflight:
     def _ask(self, now_s: float) -> None:
         ops = self._ops
         rate = self._flight.vehicle.link.state_rate_hz
-        self._pending.append(ops.set_message_interval(codec.ODOMETRY, int(1e6 / rate * ASK_FASTER), now_s))
+        self._rate = ops.set_message_interval(codec.ODOMETRY, int(1e6 / rate * ASK_FASTER), now_s)
         for msgid, hz in MESSAGE_RATES_HZ.items():
-            self._pending.append(ops.set_message_interval(msgid, int(1e6 / hz), now_s))
-        for msgid in (codec.AUTOPILOT_VERSION, HOME_POSITION):
-            self._pending.append(ops.request_message(msgid, now_s))
+            ops.set_message_interval(msgid, int(1e6 / hz), now_s)
+        self._version = ops.request_message(codec.AUTOPILOT_VERSION, now_s)
+        ops.request_message(HOME_POSITION, now_s)
         law = self._flight.output.controller == "law"
-        for name in PARAMETERS if law else (*PARAMETERS, *BASELINE_PARAMETERS):
-            self._reads[name] = ops.read_parameter(name, now_s)
-            self._pending.append(self._reads[name])
+        for name in dict.fromkeys(PARAMETERS if law else (*PARAMETERS, *BASELINE_PARAMETERS)):
+            retry = Retry() if name in NEEDED else OPTIONAL_RETRY
+            self._reads[name] = ops.read_parameter(name, now_s, retry)
 
-    def _gate_answers(self) -> None:
+    def _ask_time(self, now_s: float) -> None:
+        """TIMESYNC requests while the link is measured."""
+        own_ns = round(now_s * 1e9)
+        if now_s - self._asked_time_s >= ASK_TIME_INTERVAL_S and self.meter.asks(own_ns):
+            self._asked_time_s = now_s
+            self._ops.ask_time(own_ns)
+
+    def _known(self, now_s: float, begun_s: float) -> bool:
+        """Whether the gates can judge: all was answered, or will not be.
+
+        Raises:
+            FlightEnded: the autopilot does not answer at all.
+        """
+        assert self._rate is not None and self._version is not None
+        if self._rate.pending:
+            if now_s - begun_s > REQUEST_TIMEOUT_S:
+                raise FlightEnded(Cause.REFUSED, f"the autopilot did not answer: {self._rate.what}")
+            return False
+        if not self.meter.running:
+            self.meter.start()
+            self._measuring_from_s = now_s
+        if not self._rate.accepted or self._unread():
+            return True
+        first_s = self.meter.first_s
+        if first_s is None:
+            return now_s - self._measuring_from_s > FIRST_STATE_TIMEOUT_S
+        pending = [operation for operation in (self._version, *self._reads.values()) if operation.pending]
+        if pending and now_s - begun_s <= REQUEST_TIMEOUT_S:
+            return False
+        reported = self._reported() or now_s - self._measuring_from_s > REPORT_TIMEOUT_S
+        return reported and now_s - first_s >= MEASURE_S
+
+    def _reported(self) -> bool:
+        """Whether everything that the gates look at has been told."""
+        a = self._autopilot
+        heard = a.mode is not None and a.landed is not LandedState.UNDEFINED
+        return heard and None not in (a.system_status, a.health, a.estimator)
+
+    def _explained(self, now_s: float) -> bool:
+        """Where the autopilot would not arm it is asked why, and has had the time to say it."""
+        a = self._autopilot
+        if a.armed or a.health is None or a.health.can_arm or a.mode in DOWN or self._unread():
+            return True
+        if self._words is None:
+            self._words = self._ops.command(RUN_PREARM_CHECKS, (0.0,) * 7, "asking what prevents arming", now_s)
+        return self._words.ended_s is not None and now_s - self._words.ended_s >= WORDS_WAIT_S
+
+    def _unread(self) -> dict[str, str]:
+        """The parameters that must be known and will not be, with the reasons."""
+        reads = ((name, self._reads[name]) for name in NEEDED)
+        return {name: read.sentence for name, read in reads if not read.pending and not read.accepted}
+
+    def _judge(self, now_s: float) -> None:
+        """Lets the gates judge, and tells what people must know.
+
+        Raises:
+            FlightEnded: a gate refuses.
+        """
         for name, operation in self._reads.items():
             if operation.accepted and operation.value is not None:
                 self._autopilot.parameters[name] = float(operation.value)
-        odometry = self._pending[0]
-        if not odometry.accepted:
-            raise FlightEnded(Cause.REFUSED, f"{odometry.sentence}; the flight needs it as its one state")
-        for name in NEEDED:
-            if name not in self._autopilot.parameters:
-                raise FlightEnded(Cause.REFUSED, f"{self._reads[name].sentence}; the flight must know it")
-        sends = self._flight.output.sends
-        if self._autopilot.parameters.get("MAV_TYPE") == 0.0 and sends in {"rates", "attitude"}:
-            raise FlightEnded(
-                Cause.REFUSED,
-                "parameter MAV_TYPE is 0 (generic): PX4 then takes the thrust of SET_ATTITUDE_TARGET as zero; set it to"
-                " the vehicle's type (2 for a quadrotor)",
-            )
-        self._gate_failsafe()
-        version = self._ops.version
-        if sends == "actuators" and (version is None or not version.accepts_actuator_control):
-            label = "an unknown version" if version is None else f"version {version.label}"
-            raise FlightEnded(
-                Cause.REFUSED,
-                f"output actuators: the autopilot is {label}, and PX4 ignores SET_ACTUATOR_CONTROL_TARGET since 1.14;"
-                " use output rates",
-            )
+        assert self._rate is not None
+        words = () if self._words is None else self._ops.texts.complaints(self._words.asked_s, now_s)
+        measured = Measured(
+            *(self._flight, self._autopilot, self._ops.version, self.meter.figures(now_s), self._unread()),
+            rate_refusal="" if self._rate.accepted else self._rate.sentence,
+            complaints=tuple(words),
+        )
+        self.findings = judge(measured)
+        for finding in self.findings:
+            if finding.verdict is Verdict.WARNING:
+                self._notify(f"warning: {finding.told}")
+        against = refusal(self.findings)
+        if against:
+            raise FlightEnded(Cause.REFUSED, against)
+        self._notify(self.silence.sentence)
 
-    def _gate_failsafe(self) -> None:
-        """Something must happen when the setpoints cease: with these two there is nothing, PX4 holds the last one."""
-        parameters = self._autopilot.parameters
-        on_loss, without_sticks = parameters.get("COM_OBL_RC_ACT"), parameters.get("NAV_RCL_ACT")
-        if on_loss in _STICK_ACTIONS and without_sticks in _NO_ACTIONS:
-            raise FlightEnded(
-                Cause.REFUSED,
-                f"parameters COM_OBL_RC_ACT {on_loss:g} and NAV_RCL_ACT {without_sticks:g}: without sticks PX4 would go"
-                " on with the last setpoint when setpoints cease; set COM_OBL_RC_ACT to 5 (Hold), 4 (Land) or 3"
-                " (Return)",
-            )
-
-    def _gate_rate(self, rate: float) -> None:
-        wanted = self._flight.vehicle.link.state_rate_hz
-        floor = RATE_FLOOR * wanted
-        if rate < floor:
-            raise FlightEnded(
-                Cause.REFUSED,
-                f"ODOMETRY comes at {rate:.0f} Hz, {floor:.0f} Hz are required for the vehicle file's {wanted:.0f} Hz:"
-                " check the link's data rate, or lower link.state_rate_hz and certify again",
-            )
+    @property
+    def silence(self) -> Silence:
+        """What the autopilot does when this program falls silent."""
+        health = self._autopilot.health
+        return when_silent(self._autopilot.parameters, sticks=health is not None and health.sticks)

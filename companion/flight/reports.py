@@ -8,6 +8,7 @@ from typing import Any
 from companion.config import Vehicle
 from companion.control.types import GRAVITY_M_S2, Quat
 from companion.control.vectors import axes
+from companion.flight.health import ESTIMATOR_STATUS, SYS_STATUS, EstimatorHealth, SystemHealth
 from companion.flight.phases import Autopilot, LandedState
 from companion.flight.preflight import ATTITUDE_TARGET, CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION
 from companion.frames import GeoPoint
@@ -22,7 +23,10 @@ HOLD_THRUST_TRUST = 0.25
 """A measured hover thrust further from the weight is not believed: the vehicle file or the message is wrong."""
 
 _LANDED_STATES = {state.value: state for state in LandedState}
-_REPORTS = {CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET, BATTERY_STATUS}
+_REPORTS = {
+    *(CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET, BATTERY_STATUS),
+    *(SYS_STATUS, ESTIMATOR_STATUS),
+}
 
 
 def take_heartbeat(autopilot: Autopilot, frame: Frame) -> None:
@@ -30,11 +34,12 @@ def take_heartbeat(autopilot: Autopilot, frame: Frame) -> None:
     heartbeat = codec.decode_heartbeat(frame.payload)
     autopilot.mode = Mode.from_custom_mode(heartbeat.custom_mode)
     autopilot.armed = heartbeat.armed
+    autopilot.system_status = heartbeat.system_status
 
 
 def take_report(autopilot: Autopilot, frame: Frame) -> None:
-    """CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET, BATTERY_STATUS; others, and what cannot be
-    read, change nothing."""
+    """CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET, BATTERY_STATUS, SYS_STATUS, ESTIMATOR_STATUS;
+    others, and what cannot be read, change nothing."""
     if frame.msgid not in _REPORTS:
         return
     message: Any = codec.decode_cold(frame)
@@ -45,6 +50,10 @@ def take_report(autopilot: Autopilot, frame: Frame) -> None:
         autopilot.intended = Mode.from_custom_mode(message.intended_custom_mode)
     elif frame.msgid == EXTENDED_SYS_STATE:
         autopilot.landed = _LANDED_STATES.get(message.landed_state, LandedState.UNDEFINED)
+    elif frame.msgid == SYS_STATUS:
+        autopilot.health = SystemHealth.from_message(message)
+    elif frame.msgid == ESTIMATOR_STATUS:
+        autopilot.estimator = EstimatorHealth.from_message(message)
     elif frame.msgid == BATTERY_STATUS:
         if message.id == 0:
             autopilot.battery = None if message.battery_remaining < 0 else 1e-2 * message.battery_remaining

@@ -69,6 +69,7 @@ class Sequence:
         autopilot: what it says of itself; the loop keeps it up to date.
         engage: called with the state at which OFFBOARD was confirmed, before the first tracking step.
         notify: called with a line for people.
+        only_gates: the gates judge, and nothing is asked of the vehicle after that.
     """
 
     def __init__(
@@ -79,6 +80,8 @@ class Sequence:
         autopilot: Autopilot,
         engage: Callable[[VehicleState], None],
         notify: Callable[[str], None],
+        *,
+        only_gates: bool = False,
     ) -> None:
         self.phase = Phase.CONNECT
         self.changes: list[PhaseChange] = []
@@ -93,7 +96,8 @@ class Sequence:
         self._autopilot = autopilot
         self._engage = engage
         self._notify = notify
-        self._preflight = Preflight(flight, operations, autopilot)
+        self.preflight = Preflight(flight, operations, autopilot, notify)
+        self._only_gates = only_gates
         self._state: VehicleState | None = None
         self._state_s = 0.0
         self._since_s = 0.0
@@ -134,8 +138,6 @@ class Sequence:
     def on_state(self, state: VehicleState, now_s: float) -> None:
         """A fresh state; called before the setpoint for it is computed."""
         self._state, self._state_s = state, now_s
-        if self.phase is Phase.PREFLIGHT:
-            self._preflight.on_state(state)
         if self.ending is None and self.duty is Duty.TRACK:
             self._follow_course(state.t_vehicle_us * 1e-6)
 
@@ -152,7 +154,7 @@ class Sequence:
         if self.ending is not None:
             self._hand_over(now_s)
         elif self.phase is Phase.PREFLIGHT:
-            if self._preflight.done(now_s):
+            if self.preflight.done(now_s):
                 self._after_preflight(now_s)
         elif self.phase is Phase.TAKEOFF:
             self._take_off(now_s)
@@ -195,9 +197,9 @@ class Sequence:
     # -- phases ---------------------------------------------------------------------------------------------------
 
     def _after_preflight(self, now_s: float) -> None:
+        if self._only_gates:
+            raise FlightEnded(Cause.INSPECTED, "every gate lets it pass")
         landed = self._autopilot.landed
-        if landed is LandedState.UNDEFINED:
-            raise FlightEnded(Cause.REFUSED, "the autopilot does not say whether it stands on the ground or flies")
         if landed is LandedState.ON_GROUND or not self._autopilot.armed:
             self.enter(Phase.TAKEOFF, now_s, f"all gates passed; climbing to {self._flight.takeoff_altitude_m:g} m")
         else:
@@ -208,7 +210,7 @@ class Sequence:
         """NAV_TAKEOFF, then arming, then waiting until the autopilot holds up there."""
         state = self._state
         if self._operation is None:
-            self._operation = self._ops.takeoff(self._preflight.takeoff_amsl_m(state), now_s)
+            self._operation = self._ops.takeoff(self.preflight.takeoff_amsl_m(state), now_s)
         if self._operation.pending or self._refused(self._operation, now_s):
             return
         if not self._asked:
@@ -388,7 +390,8 @@ class Sequence:
         if self.phase is Phase.TAKEOFF:
             return {modes.TAKEOFF, modes.HOLD} if self._mode_seen and self._autopilot.armed else None
         if self.phase is Phase.LAND:
-            if not self._autopilot.armed:
+            # On the ground PX4 goes back to the mode that was meant before, and says so before it says disarmed.
+            if not self._autopilot.armed or self._autopilot.landed is LandedState.ON_GROUND:
                 return None
             before = self._mode_at_landing or modes.OFFBOARD
             return {modes.LAND} if self._mode_seen else {modes.OFFBOARD, modes.LAND, before}

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
-from companion.link import codec
+from companion.link import codec, timesync
 from companion.link.commands import CommandQueue, Params
 from companion.link.framing import Frame
 from companion.link.modes import Mode
@@ -150,6 +150,10 @@ class Operations:
             ValueError: no parameter can have this name.
         """
         return self._parameters.ask(name, Operation(f"reading {name}", now_s, self.texts), retry)
+
+    def ask_time(self, own_ns: int) -> None:
+        """Ask for the autopilot's clock (TIMESYNC); the answer, with `own_ns` in ts1, is not taken here."""
+        self._send(codec.TIMESYNC, timesync.request(own_ns, self.target_system, self.target_component))
 
     def on_frame(self, frame: Frame, now_s: float) -> bool:
         """Take a frame; False when it is none of ours (other senders, other messages, answers to others)."""

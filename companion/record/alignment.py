@@ -32,8 +32,10 @@ _LEAST_AGREEMENT: Final = 0.8
 _MOVING_M_S: Final = 0.05
 SAME_FLIGHT_M_S: Final = 0.03
 """Both logs of a flight have the velocities of one estimator."""
-_CLEAR: Final = 3.0
+_CLEAR: Final = 2.0
 """The next best offset leaves so many times the difference, or the offset is ambiguous."""
+_NOTHING_M_S: Final = 0.005
+"""Less than this remains only where both are the same."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,10 @@ def align(first: Motion, second: Motion) -> Fit:
     elsewhere = np.where(valley & (np.abs(lags - lags[best]) * _STEP_S > _APART_S), cost, np.inf)
     if not np.isfinite(elsewhere).any():
         return fit
-    runner_up = int(np.argmin(elsewhere))
-    runner_up_s = one.begin_s - other.begin_s + float(lags[runner_up]) * _STEP_S
-    return fit._replace(runner_up_s=runner_up_s, clear=bool(elsewhere[runner_up] > _CLEAR * cost[best]))
+    other_lag = _refined(one, other, float(lags[int(np.argmin(elsewhere))]))
+    runner_up = _fit(first, second, one.begin_s - other.begin_s + other_lag * _STEP_S)
+    as_good = runner_up.velocity_rms_m_s < max(_CLEAR * fit.velocity_rms_m_s, _NOTHING_M_S)
+    return fit._replace(runner_up_s=runner_up.offset_s, clear=not as_good)
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ def _from_log(path: Path) -> FlightSource:
     outcome = _json_object(log, "outcome", {"sentence", "cause", "rejected_states"})
     if not outcome:
         missing.append("the log does not have the flight's end: the program was killed, or the rest of the log is lost")
-    dropped = log.topics[topics.LINK.name]["dropped"] if topics.LINK.name in log.topics else []
+    dropped = log.topics.get(topics.LINK.name, {}).get("dropped", [])
     if len(dropped) and dropped[-1]:
         missing.append(f"{dropped[-1]} entries never reached the log: its writer was too slow")
     summary = _summary(log, record, configuration, outcome)
@@ -147,17 +147,18 @@ def _from_log(path: Path) -> FlightSource:
 def _record(log: LogFile, missing: list[str]) -> FlightRecord:
     """The record out of the topics of the control steps: bit by bit, where the log is whole."""
     names = _phase_names(log)
-    if topics.STEP.name not in log.topics:
+    if topics.STEP.name not in log.topics or "t_s" not in log.topics[topics.STEP.name]:
         missing.append("no control step is in the log")
         return FlightRecord(0, names)
     stamps = np.asarray(log.topics[topics.STEP.name]["timestamp"])
     t_s = log.column(topics.STEP.name, "t_s")
     good = np.isfinite(t_s) & (np.abs(1e6 * t_s - stamps) < 1.0) & np.concatenate(([True], np.diff(t_s) > 0.0))
     table = np.full((len(stamps), len(COLUMNS)), np.nan)
+    whole = np.ones(len(stamps), dtype=np.bool_)
     for topic in topics.STEP_TOPICS:
-        if topic.name in log.topics:
-            _fill(table, log, topic, stamps)
-    if not good.all():
+        whole &= topic.name in log.topics and _fill(table, log, topic, stamps)
+    good[-1] &= whole[-1]  # the rest of the last step may be behind the log's end
+    if not good[:-1].all():
         missing.append(f"{np.count_nonzero(~good)} control steps have no time that can be right and are left out")
     table = table[good]
     table[~(np.abs(table) < _LARGEST)] = np.nan
@@ -167,8 +168,11 @@ def _record(log: LogFile, missing: list[str]) -> FlightRecord:
     return record
 
 
-def _fill(table: Array, log: LogFile, topic: topics.Topic, stamps: Any) -> None:
-    """Put a topic's numbers into the rows with their timestamps; a row that the topic lost stays NaN."""
+def _fill(table: Array, log: LogFile, topic: topics.Topic, stamps: Any) -> Any:
+    """Put a topic's numbers into the rows with their timestamps; a row that the topic lost stays NaN.
+
+    Returns which rows it has, shape (len,).
+    """
     data = log.topics[topic.name]
     own = np.asarray(data["timestamp"])
     same = len(own) == len(stamps) and bool(np.all(own == stamps))
@@ -178,8 +182,10 @@ def _fill(table: Array, log: LogFile, topic: topics.Topic, stamps: Any) -> None:
         for index, name in enumerate(entry.columns):
             column = COLUMN_INDEX.get(name)
             if column is not None and entry.basic_type == "double":
-                numbers = np.asarray(data[f"{entry.name}[{index}]" if entry.size > 1 else entry.name])
-                table[here, column] = numbers[at[here]]
+                numbers = data.get(f"{entry.name}[{index}]" if entry.size > 1 else entry.name)
+                if numbers is not None:
+                    table[here, column] = np.asarray(numbers, dtype=np.float64)[at[here]]
+    return here
 
 
 def _phase_names(log: LogFile) -> tuple[str, ...]:

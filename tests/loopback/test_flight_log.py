@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import socket
 import subprocess
@@ -16,11 +17,14 @@ import pytest
 from flight_cases import HOVER, Stand, make_flight
 from pyulog import ULog
 
+from companion.campaign.replay import replay
 from companion.flight.launch import control
 from companion.flight.phases import PHASE_NAMES
+from companion.flight.tracker import kernels
 from companion.record import topics
 from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES
 from companion.record.flight_record import FlightRecord
+from companion.record.flight_source import read_source
 from companion.record.folder import CONFIGURATION_FILE, read_summary, write_configuration
 
 PATIENCE_S = 60.0
@@ -88,6 +92,12 @@ def test_a_flights_log_has_all_that_its_record_has(tmp_path: Path, who: str) -> 
     for phase in read_summary(folder)["phases"]:
         assert f"{phase['name']}: {phase['reason']}" in said
     assert said[-1] == flown.sentence
+    folder_summary, source = read_source(folder).summary, read_source(folder / "flight.ulg")
+    assert source.missing == ()
+    assert source.record.rows.tobytes() == record.rows.tobytes()
+    assert json.loads(json.dumps(source.summary)) == folder_summary
+    if who == "law":
+        assert replay(folder / "flight.ulg", kernels("python")).identical
     status = log.get_dataset("vehicle_status").data
     assert [mode for mode, _ in itertools.groupby(status["nav_state"])] == [4, 14, 4]
 
@@ -121,6 +131,11 @@ def test_a_killed_control_process_leaves_its_log(tmp_path: Path) -> None:
 
     interval_us = 1e6 / flight.vehicle.link.state_rate_hz
     until(lambda: answered_us - last_us() <= flight.vehicle.link.state_age_s * 1e6 + 2 * interval_us)
+    # the folder is as good as the log in it
+    source = read_source(folder)
+    assert source.summary["verdict"].startswith("incomplete")
+    assert len(source.record) > 0.4 * flight.vehicle.link.state_rate_hz
+    assert replay(folder, kernels("python")).identical
 
 
 def test_the_phases_that_the_log_names_are_the_flights() -> None:

@@ -68,7 +68,10 @@ def test_other_gains_differ_and_are_drawn(folder, tmp_path):
 
 
 def test_what_cannot_be_replayed_is_said(folder, tmp_path):
-    assert run(str(tmp_path)) == (2, f"{tmp_path / 'flight.toml'}: there is no flight; give the folder of one")
+    assert run(str(tmp_path)) == (
+        2,
+        f"{tmp_path / 'record.npz'}: there is no flight record; give the folder of a flight",
+    )
     code, text = run(str(folder), "--set", "controller.k9=1")
     assert code == 2
     assert "the vehicle file has no controller.k9" in text

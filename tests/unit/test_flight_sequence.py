@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from companion.config import build_flight
+from companion.flight.health import EstimatorFlag, EstimatorHealth, SystemHealth
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Phase
 from companion.flight.sequence import Duty, Sequence
 from companion.link import codec, modes
@@ -57,8 +58,11 @@ class FakeOperations:
     def request_message(self, msgid: int, now_s: float) -> Operation:
         return self._ask(f"message {msgid}", now_s)
 
-    def read_parameter(self, name: str, now_s: float) -> Operation:
-        return self._ask(f"reading {name}", now_s, PARAMETERS[name])
+    def read_parameter(self, name: str, now_s: float, retry: Any = None) -> Operation:
+        return self._ask(f"reading {name}", now_s, PARAMETERS.get(name))
+
+    def ask_time(self, own_ns: int) -> None:
+        """Nobody answers here."""
 
     def update(self, now_s: float) -> None:
         """Nothing is repeated here."""
@@ -83,7 +87,9 @@ class Script:
         data = {"name": "test", "vehicle": "paper", "trajectory": trajectory, "after": after}
         flight = build_flight(data, "test")
         self.ops = FakeOperations()
-        self.autopilot = Autopilot(modes.HOLD, modes.HOLD, armed, landed)
+        self.autopilot = Autopilot(modes.HOLD, modes.HOLD, armed, landed, system_status=4)
+        self.autopilot.health = SystemHealth(sticks=False, fence_kept=None, can_arm=True, battery=1.0)
+        self.autopilot.estimator = EstimatorHealth(EstimatorFlag(63), 0.0, 0.0, 0.0, 0.0, 0.1)
         self.autopilot.home, self.autopilot.home_amsl_m = (0.0, 0.0, 0.0), 488.0
         self.engaged: list[VehicleState] = []
         self.speed = 0.0
@@ -101,6 +107,7 @@ class Script:
             self.now_s += 1.0 / RATE_HZ
             t_us = round(self.now_s * 1e6)
             state = VehicleState(t_us, (0.0, 0.0, -5.0), (self.speed, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0,) * 3, 0)
+            self.sequence.preflight.meter.on_state(state, self.now_s, paced=False)
             self.sequence.on_state(state, self.now_s)
             self.sequence.tick(self.now_s)
 
@@ -251,6 +258,16 @@ def test_landing_ends_on_the_ground() -> None:
     script.autopilot.armed = False
     ended = script.ends()
     assert (ended.cause, ended.detail) == (Cause.COMPLETED, "landed and disarmed")
+
+
+def test_px4_goes_back_to_offboard_on_the_ground_before_it_says_disarmed() -> None:
+    script = landing()
+    script.autopilot.landed = LandedState.ON_GROUND
+    script.run(0.5)
+    script.be(modes.OFFBOARD)
+    script.run(0.9)
+    script.autopilot.armed = False
+    assert script.ends().cause is Cause.COMPLETED
 
 
 def test_pilot_takes_over_during_the_landing() -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import resource
+import shutil
 import signal
 import socket
 import subprocess
@@ -256,6 +257,37 @@ def test_a_full_disk_leaves_logs_that_can_be_read(tmp_path, capfd):
     assert steps == [float(index) for index in range(len(steps))]
     assert 0 < len(steps) < 500
     assert 0 < len(list(read_tlog(tmp_path / "link.tlog"))) < 501
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Path]:
+    """A file system of 256 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount, umount = shutil.which("mount"), shutil.which("umount")
+    if os.geteuid() != 0 or mount is None or umount is None:
+        pytest.skip("only root can mount a small file system")
+    made = subprocess.run([mount, "-t", "tmpfs", "-o", "size=256k", "none", str(place)], capture_output=True, check=False)
+    if made.returncode:
+        pytest.skip("no small file system can be mounted here")
+    yield place
+    subprocess.run([umount, "--lazy", str(place)], check=True)
+
+
+def test_a_full_file_system_ends_the_logs_and_nothing_else(small_disk, capfd):
+    recorder = Recorder.start(small_disk)
+    record = FlightRecord(1000)
+    recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    offer_steps(recorder, record, 1000)
+    recorder.close()
+    assert (len(record), recorder.recorded is not None) == (1000, True)
+    assert recorder.problem is not None
+    assert "the disk did not take everything" in recorder.problem
+    said = capfd.readouterr().err
+    assert said.count("No space left on device; nothing more is written, the flight goes on") in {1, 2}
+    steps = logged_steps(small_disk)
+    assert steps == [float(index) for index in range(len(steps))]
+    assert len(steps) < 1000
 
 
 def test_started_by_hand_it_explains_itself():

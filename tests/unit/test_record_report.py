@@ -211,6 +211,31 @@ def test_thin_keeps_spikes_ends_and_gaps():
     assert thin(series[:50], 100).tolist() == list(range(50))
 
 
+def test_ten_minutes_at_250_hz_stay_small_and_keep_their_peaks(tmp_path, record):
+    rows = np.tile(record.rows[record.in_phase("track")], (26, 1))[:150_000]
+    long = record.select(np.zeros(len(rows), dtype=np.intp))
+    long.rows[:] = rows
+    long.column("track_s")[:] = 0.004 * np.arange(len(rows))
+    long.column("t_s")[:] = 104.0 + long.column("track_s")
+    spikes = {"error_n": 77_777, "thrust_n": 123_456, "step_us": 9, "w_x": 149_990}
+    for column, at in spikes.items():
+        long.column(column)[at] = 5e4
+    path = build_report(fill(tmp_path, long))
+    assert path.stat().st_size < 8_000_000
+    page = Page(path)
+    for (key, name, axis), scale in {
+        ("position-error", "distance from the reference", "y"): 1.0,
+        ("actuation", "thrust", "y"): 1.0,
+        ("timing", "control step", "y"): 1e-3,
+        ("rates", "actual", "y2"): 1.0,
+    }.items():
+        time_s, values = page.trace(key, name, axis)
+        assert values.max() == pytest.approx(5e4 * scale, rel=1e-4)
+        assert len(time_s) < 4000
+    time_s, values = page.trace("actuation", "thrust")
+    assert time_s[values.argmax()] == pytest.approx(0.004 * spikes["thrust_n"], abs=1e-3)
+
+
 def test_without_truth_and_configuration(tmp_path, record):
     page = Page(build_report(fill(tmp_path, record.select(np.arange(0, len(record), 10)))))
     assert list(page.figures) == ALL

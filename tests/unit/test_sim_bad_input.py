@@ -124,6 +124,16 @@ def is_finite(v: Vehicle) -> bool:
     return all(map(math.isfinite, (*truth.p, *truth.v, *truth.q, *truth.w, *truth.rotor_n)))
 
 
+def numbers_in(sock: socket.socket) -> list[int]:
+    """The numbers of all messages that wait in a socket."""
+    found = []
+    while True:
+        try:
+            found += [frame.msg_id for frame in frames(sock.recv(2048))]
+        except BlockingIOError:
+            return found
+
+
 class Lines:
     """A peer that does not wait for the clock, and a socket on each of its links."""
 
@@ -151,12 +161,7 @@ class Lines:
 
     def heard(self) -> list[int]:
         """The numbers of all messages that have come from the companion link since the last time."""
-        found = []
-        while True:
-            try:
-                found += [frame.msg_id for frame in frames(self.companion.recv(2048))]
-            except BlockingIOError:
-                return found
+        return numbers_in(self.companion)
 
 
 @settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
@@ -374,6 +379,26 @@ def test_of_too_many_texts_a_few_are_sent() -> None:
     sent = [frames(raw)[0].msg_id for raw in v.companion.outbox].count(mavlink.MAVLINK_MSG_ID_STATUSTEXT)
     assert 1 <= sent <= 10
     assert not v.autopilot.texts
+
+
+def test_a_companion_that_answers_at_once_does_not_keep_the_ground_link_from_being_heard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    v = vehicle()
+    with Lines(v, lockstep=True) as lines:
+        endpoint = lines.peer.companion
+        sender = endpoint.partner = lines.companion.getsockname()
+
+        def answer():
+            return frames(framed(111, struct.pack("<qqBB", 1, lines.peer._awaited_ns, 0, 0))), sender
+
+        monkeypatch.setattr(endpoint, "receive", answer)
+        lines.peer.step()
+        lines.to_ground_link(request(148))
+        for _ in range(2):
+            lines.peer.step()
+        assert lines.peer.synchronous
+        assert mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION in numbers_in(lines.ground)
 
 
 def test_what_a_state_is_allowed() -> None:

@@ -1,0 +1,74 @@
+"""The offset between the autopilot's clock and ours, from TIMESYNC requests of our own.
+
+An exchange with the shortest round trip was held up least, so of the last seconds that one counts. The offset that is
+used follows slowly and never steps: with a step, states would seem older or younger from one moment to the next.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from companion.link.codec import Timesync
+from companion.link.timesync import ClockOffset, clock_offset
+
+WINDOW_NS: Final = 10_000_000_000
+"""Of the exchanges within, the one with the shortest round trip counts."""
+DRIFT: Final = 5e-5
+"""How far two clocks may drift apart: an old exchange counts as longer by as much of its age."""
+SLEW: Final = 1e-3
+"""The offset follows by no more than this share of the time that passes."""
+OUTSTANDING_MAX: Final = 50
+
+
+class OffsetFilter:
+    """Follows the offset of one link."""
+
+    def __init__(self) -> None:
+        self.round_trip_ns: int | None = None
+        """Of the exchange that counts; the offset is wrong by at most half of it."""
+        self.answered_ns: int | None = None
+        """Our clock when the last answer came."""
+        self._asked: dict[int, None] = {}
+        self._exchanges: deque[tuple[int, ClockOffset]] = deque()
+        self._used_ns: float | None = None
+        self._target_ns = 0
+        self._at_ns = 0
+
+    def asked(self, own_ns: int) -> None:
+        """A request with this time in ts1 goes out."""
+        if len(self._asked) >= OUTSTANDING_MAX:
+            del self._asked[next(iter(self._asked))]
+        self._asked[own_ns] = None
+
+    def on_answer(self, message: Timesync, received_ns: int) -> bool:
+        """Takes an answer; False when it is to none of our requests, or came already."""
+        if message.ts1 not in self._asked:
+            return False
+        del self._asked[message.ts1]
+        exchange = clock_offset(message, received_ns)
+        exchanges = self._exchanges
+        exchanges.append((received_ns, exchange))
+        while received_ns - exchanges[0][0] > WINDOW_NS:
+            exchanges.popleft()
+        best = min(exchanges, key=lambda known: known[1].round_trip_ns + DRIFT * (received_ns - known[0]))[1]
+        self.offset_ns(received_ns)
+        self.answered_ns = received_ns
+        self.round_trip_ns, self._target_ns = best.round_trip_ns, best.offset_ns
+        if self._used_ns is None:
+            self._used_ns, self._at_ns = float(best.offset_ns), received_ns
+        return True
+
+    def settle(self) -> None:
+        """Takes the best offset at once: before a flight, when nothing depends on it yet."""
+        if self._used_ns is not None:
+            self._used_ns = float(self._target_ns)
+
+    def offset_ns(self, own_ns: int) -> int | None:
+        """The autopilot's clock less ours, at a time of ours; None before the first answer."""
+        if self._used_ns is None:
+            return None
+        most = SLEW * max(0, own_ns - self._at_ns)
+        self._used_ns += min(max(self._target_ns - self._used_ns, -most), most)
+        self._at_ns = max(own_ns, self._at_ns)
+        return round(self._used_ns)
