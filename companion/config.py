@@ -29,6 +29,8 @@ PositiveVector = tuple[Positive, Positive, Positive]
 NotNegativeVector = tuple[NotNegative, NotNegative, NotNegative]
 FourNumbers = tuple[Finite, Finite, Finite, Finite]
 
+STATE_AGE_ROOM_S = 0.05
+"""States may be so much older than the vehicle file says, unless it says otherwise."""
 HEADINGS = {"damping": heading.DAMPING, "sideslip": heading.SIDESLIP, "commanded": heading.COMMANDED}
 
 
@@ -73,6 +75,9 @@ class Link(Section):
     state_rate_hz: Annotated[float, Field(ge=10.0, le=1000.0)]
     state_age_s: Annotated[float, Field(ge=0.0, le=0.5)]
     command_delay_s: Annotated[float, Field(ge=0.0, le=0.5)]
+    measure_age: bool = True
+    """Whether the prediction goes by the measured age of the states; false where the two above are only known
+    together, as one delay."""
 
 
 class Noise(Section):
@@ -122,6 +127,25 @@ class FlightLimits(Section):
     acceleration_max_m_s2: Positive
     state_gap_max_s: Positive = 0.1
     position_error_abort_m: Positive = 100.0
+    # What follows are limits of the guards (docs/guards.md).
+    estimate_jump_max_m: Positive = 2.0
+    estimate_jump_max_m_s: Positive = 1.0
+    estimate_jump_max_rad: Positive = 0.5
+    disturbance_step_m_s2: NotNegative | None = None
+    """Largest step of the horizontal disturbance that a flight is to bear; None: disturbance_max_m_s2."""
+    disturbance_step_vertical_m_s2: NotNegative = 0.5
+    state_rate_min: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)] = 0.6
+    """Share of link.state_rate_hz."""
+    state_age_max_s: Positive | None = None
+    """None: link.state_age_s and 50 ms."""
+    late_steps_max: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)] = 0.3
+    """Share of the steps of a second."""
+    battery_min: Annotated[float, Field(ge=0.0, lt=1.0, allow_inf_nan=False)] = 0.15
+    link_silence_max_s: Positive = 2.0
+    fence_radius_m: Positive | None = None
+    """Horizontal distance from home, or from where the flight began while home is not known; None: no fence."""
+    fence_height_m: Positive | None = None
+    """Above the same."""
 
     @model_validator(mode="after")
     def _ordered(self) -> FlightLimits:
@@ -163,6 +187,12 @@ class Vehicle(Section):
     def delay_s(self) -> float:
         """From the stamp of a state to the effect of the command computed from it [s]."""
         return self.link.state_age_s + self.link.command_delay_s
+
+    @property
+    def state_age_max_s(self) -> float:
+        """Oldest that states may be when they arrive [s]."""
+        most = self.limits.state_age_max_s
+        return self.link.state_age_s + STATE_AGE_ROOM_S if most is None else most
 
     @property
     def thrust_full_n(self) -> float:

@@ -24,6 +24,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink2
+
 from companion import accelerate
 from companion.config import load_flight
 from companion.control.types import State
@@ -35,8 +38,12 @@ from companion.ground.upload import Files
 from companion.link import codec
 from companion.link.framing import Frame
 from companion.link.wire import Wire
-from companion.record.summary import without_wall_clock
-from companion.record.tlog import read_tlog
+from companion.record.columns import COLUMNS
+from companion.record.flight_source import FlightSource
+from companion.record.recorder import Recorder
+from companion.record.report import build_report
+from companion.record.summary import FlightMeta, summarise, without_wall_clock
+from companion.record.tlog import Direction, read_tlog
 from companion.trajectory.anchored import Trajectory, anchored
 from companion.trajectory.feasibility import check
 from companion.trajectory.load import load
@@ -272,6 +279,98 @@ def transfers(base: Path, repeats: int) -> list[tuple[str, str, str]]:
     return rows
 
 
+def recording(base: Path) -> list[tuple[str, str, str]]:
+    """What handing over a control step to the recorder costs, and what an hour of flight leaves in memory."""
+    row = np.random.default_rng(1).normal(size=len(COLUMNS))
+    link = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
+    none = [0.0] * 21
+
+    def state(t_us: int) -> bytes:
+        return bytes(
+            mavlink2.MAVLink_odometry_message(t_us, 1, 1, *[0.0] * 3, [1, 0, 0, 0], *[0.0] * 6, none, none).pack(link)
+        )
+
+    folder = base / "recording"
+    folder.mkdir(parents=True)
+    recorder = Recorder.start(folder)
+    raw, content = state(1_000_000), memoryview(row.tobytes())
+
+    def one_step(_: int) -> None:
+        now_ns = time.monotonic_ns()
+        recorder.offer(Direction.IN, raw, now_ns)
+        recorder.offer(Direction.OUT, raw, now_ns)
+        recorder.offer_row(content)
+
+    cost = median_us(one_step)
+    recorder.close()
+    before, after = _an_hour(base / "hour", state, row)
+    growth = [(b - a) / 1024.0 for a, b in zip(before, after, strict=True)]
+    return [
+        ("recording: state, setpoint and row of a step, median", "< 5 us", f"{cost:.2f} us"),
+        (
+            "memory after an hour of flight, control side / recorder",
+            "< 10 MB more",
+            f"{growth[0]:+.1f} MB / {growth[1]:+.1f} MB",
+        ),
+    ]
+
+
+def _an_hour(folder: Path, state: Callable[[int], bytes], row: Any) -> tuple[list[int], list[int]]:
+    """Resident memory [kB] of this process and the recorder's after the first minute and after an hour of steps at
+    250 Hz, handed over as fast as the recorder takes them."""
+    folder.mkdir(parents=True)
+    recorder = Recorder.start(folder)
+    link = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
+    recorder.offer(Direction.IN, mavlink2.MAVLink_heartbeat_message(2, 12, 81, 0, 4, 3).pack(link), 1)
+    raw = state(1_000_000)
+    found = []
+    for index in range(3600 * 250 + 1):
+        row[0] = 1.0 + 0.004 * index
+        if index % 25 == 0:  # the vehicle's time goes on
+            raw = state(1_000_000 + 4000 * index)
+        recorder.offer(Direction.IN, raw, index)
+        recorder.offer_row(row.tobytes())
+        if index % 250 == 0:
+            while recorder.behind > 10_000:
+                time.sleep(0.02)
+        if index in {60 * 250, 3600 * 250}:
+            while recorder.behind:
+                time.sleep(0.1)
+            time.sleep(2.0)  # for the disk
+            found.append([_resident_kb(os.getpid()), _resident_kb(recorder.pid)])
+    recorder.close(120.0)
+    if recorder.dropped:
+        print(f"an hour of flight: {recorder.problem}", file=sys.stderr)
+    (folder / "flight.ulg").unlink()
+    (folder / "link.tlog").unlink()
+    return found[0], found[1]
+
+
+def _resident_kb(pid: int) -> int:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmRSS")).split()[1])
+
+
+def opening(base: Path) -> list[tuple[str, str, str]]:
+    """How long a report of ten minutes takes to open in a real browser."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "unit"))
+    from chromium import Chromium, installed
+    from record_cases import PHASES, synthetic_flight
+
+    program = installed()
+    if program is None:
+        return [("report of a 10-minute flight, opened in chromium", "< 3 s", "chromium is not installed")]
+    record = synthetic_flight(600.0)
+    folder = base / "long"
+    folder.mkdir(parents=True)
+    page = build_report(FlightSource(folder, record, summarise(record, PHASES, FlightMeta("paper", "quad")), {}, ""))
+    with Chromium(program) as browser:
+        browser.size(1200, 900)
+        seen = sorted(browser.open(page) for _ in range(3))
+    size = f"{page.stat().st_size / 1e6:.1f} MB"
+    return [("report of a 10-minute flight, opened in chromium", "< 3 s, < 8 MB", f"{seen[1]:.2f} s, {size}")]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one flight per kind")
@@ -290,6 +389,7 @@ def main() -> None:
             + flights(base, arguments.quick)
         )
         rows += [] if arguments.quick else wind(base)
+        rows += recording(base) + opening(base)
     print(f"Python {platform.python_version()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
     print("| figure | reach | seen |\n|---|---|---|")
     for row in rows:

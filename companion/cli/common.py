@@ -129,6 +129,7 @@ class FlightDisplay:
             console=self._console,
             refresh_per_second=5,
             transient=True,
+            disable=not self._console.is_terminal,  # in a file it would leave an empty line
         )
         self._task: Any = None
 

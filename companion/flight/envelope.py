@@ -28,9 +28,6 @@ STRIDES = 120
 """The decay is tabulated over 6 s; afterwards it stays at its last value."""
 _SUBSTEPS = 5
 
-# where the components of the four errors stand among the numbers of a step
-_NORTH, _EAST, _DOWN = (slice(flat.ERRORS.start + axis, flat.ERRORS.stop, 3) for axis in range(3))
-
 
 class Envelope:
     """The envelope of one gain set.

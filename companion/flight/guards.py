@@ -1,80 +1,286 @@
-"""The bounds that a flight is ended by, and the setpoint that ends it when there is no state to fly on."""
+"""The guards of a flight: what is watched while the controller flies, by which limit, and what is done about it.
+
+`Guard` is the table. A guard that is broken for as long as a stage says is answered with that stage's response; the
+responses are a ladder, each rung harder than the one before (`flight.responses` climbs it). Guards look at a step after
+its setpoint is out, and at what changes slowly ten times per second. Their time is the vehicle's, so that in lockstep
+the same flight breaks the same guards at the same states; what only the wall clock knows is not judged there.
+"""
 
 from __future__ import annotations
 
 import math
+from enum import Enum, IntEnum
+from typing import NamedTuple
 
-from companion.config import Flight, FlightLimits
-from companion.control.output import (
-    ActuatorSetpoint,
-    AttitudeSetpoint,
-    PositionSetpoint,
-    RateSetpoint,
-    Setpoint,
-    thrust_fraction,
+from companion.config import FlightLimits, Vehicle
+from companion.control import flat
+from companion.control.law import (
+    LIMIT_DISTURBANCE,
+    LIMIT_ROLL_PITCH_RATE,
+    LIMIT_THRUST_MAX,
+    LIMIT_THRUST_MIN,
+    LIMIT_YAW_RATE,
+    Parameters,
 )
-from companion.control.types import GRAVITY_M_S2, Quat, Vec3
-from companion.control.vectors import axes
+from companion.control.types import Quat, Vec3
+from companion.flight.envelope import Envelope
 from companion.flight.phases import Cause
 from companion.frames import tilt_from_quat
 
-TILT_FOR_S = 0.2
-"""A tilt beyond its limit for this long ends the flight; a shorter one is a gust."""
-COSINE_MIN = 0.3
-"""The coast setpoint makes up for the tilt no further than this."""
+_THRUST = LIMIT_THRUST_MIN | LIMIT_THRUST_MAX
+_RATES = LIMIT_ROLL_PITCH_RATE | LIMIT_YAW_RATE
+EASY_S = 3.0
+"""A reference that was slowed down gets its pace back when nothing is wrong for so long."""
+BATTERY_CRITICAL = 0.5
+"""Share of limits.battery_min below which the vehicle lands where it is."""
 
-Finding = tuple[Cause, str]
+
+class Response(IntEnum):
+    """What is done, from the mildest to the hardest."""
+
+    RESUME = 0
+    """The reference gets its own pace back."""
+    SLOW = 1
+    """The reference slows down to half its pace."""
+    REST = 2
+    """The reference comes to rest on its path, then the autopilot gets the vehicle in Hold."""
+    HOLD = 3
+    """The autopilot gets the vehicle in Hold at once; where it refuses, it is to land, and then nothing more is sent."""
+    LAND = 4
+    """The autopilot is to land the vehicle at once."""
+
+
+class Stage(NamedTuple):
+    """A response to what lasts."""
+
+    after_s: float
+    response: Response
+
+
+class Rule(NamedTuple):
+    """One guard."""
+
+    cause: Cause
+    """What a flight that it ends ended by; its sentence is the guard's."""
+    key: str
+    """The limit's name in [limits] of the vehicle file, or what else it is."""
+    stages: tuple[Stage, ...]
+    """In the order of their times."""
+
+
+class Guard(Enum):
+    """All guards: what is watched, by which limit, for how long, and what follows."""
+
+    POSITION_ERROR = Rule(Cause.POSITION_ERROR, "limits.position_error_abort_m", (Stage(0.0, Response.HOLD),))
+    BEHIND = Rule(Cause.POSITION_ERROR, "controller.position_error_max_m", (Stage(0.5, Response.SLOW),))
+    TILT = Rule(Cause.TILT, "limits.tilt_max_rad", (Stage(0.2, Response.HOLD),))
+    LYAPUNOV = Rule(Cause.LYAPUNOV, "the envelope", (Stage(0.3, Response.REST), Stage(2.5, Response.HOLD)))
+    DISTURBANCE = Rule(
+        Cause.DISTURBANCE, "limits.disturbance_max_m_s2", (Stage(2.0, Response.SLOW), Stage(5.0, Response.REST))
+    )
+    THRUST = Rule(
+        *(Cause.THRUST, "limits.thrust_min_n, thrust_max_n"),
+        (Stage(0.5, Response.SLOW), Stage(2.0, Response.REST), Stage(6.0, Response.HOLD)),
+    )
+    RATES = Rule(
+        *(Cause.RATES, "limits.rate_max_rad_s"),
+        (Stage(1.0, Response.SLOW), Stage(3.0, Response.REST), Stage(6.0, Response.HOLD)),
+    )
+    STATE_RATE = Rule(
+        Cause.STATE_RATE, "limits.state_rate_min", (Stage(0.5, Response.SLOW), Stage(2.0, Response.HOLD))
+    )
+    STATE_AGE = Rule(Cause.STATE_AGE, "limits.state_age_max_s", (Stage(0.3, Response.SLOW), Stage(1.0, Response.HOLD)))
+    LATE_STEPS = Rule(Cause.LATE_STEPS, "limits.late_steps_max", (Stage(1.0, Response.SLOW), Stage(5.0, Response.REST)))
+    ESTIMATOR = Rule(Cause.ESTIMATOR, "ESTIMATOR_STATUS", (Stage(0.5, Response.HOLD),))
+    FENCE = Rule(Cause.FENCE, "the fence", (Stage(0.2, Response.HOLD),))
+    BATTERY = Rule(Cause.BATTERY, "limits.battery_min", (Stage(1.0, Response.REST),))
+    BATTERY_CRITICAL = Rule(Cause.BATTERY, "half of limits.battery_min", (Stage(1.0, Response.LAND),))
+    LINK = Rule(Cause.LINK_ONE_WAY, "limits.link_silence_max_s", (Stage(0.0, Response.HOLD),))
+    FAILSAFE = Rule(Cause.FAILSAFE, "MAV_STATE", (Stage(0.0, Response.HOLD),))
+
+
+class Finding(NamedTuple):
+    """A guard that is broken, and what it asks for now."""
+
+    guard: Guard | None
+    """None: nothing is wrong any more."""
+    response: Response
+    detail: str
+    """Figures, for people."""
+
+
+class Slow(NamedTuple):
+    """What changes slowly; None where it is not known, or must not be judged."""
+
+    state_rate_hz: float | None = None
+    state_age_s: float | None = None
+    late_share: float | None = None
+    """Of the steps of the last second, those that went out late."""
+    estimator: tuple[str, ...] = ()
+    """What the estimate lacks, for people."""
+    fence: str = ""
+    """Which fence is broken, for people; "": none."""
+    battery: float | None = None
+    """Share that is left."""
+    unanswered_s: float | None = None
+    """Since the autopilot last answered us."""
+    failsafe: str = ""
+    """What the autopilot says that is wrong; "": nothing."""
 
 
 class Guards:
-    """Watches the states of a flight."""
+    """Watches one flight.
 
-    def __init__(self, limits: FlightLimits) -> None:
-        self._limits = limits
-        self._tilted_since_s: float | None = None
+    Args:
+        vehicle: for the limits.
+        parameters: the law's; None where it does not fly.
+    """
 
-    def check(self, q: Quat, error: Vec3, now_s: float) -> Finding | None:
-        """What ends the flight at this state, if anything.
+    def __init__(self, vehicle: Vehicle, parameters: Parameters | None) -> None:
+        self._vehicle, self._limits = vehicle, vehicle.limits
+        self._since: dict[Guard, float] = {}
+        self._answered: dict[Guard, int] = {}
+        """How many of its stages a guard that is broken has had."""
+        self._slowed = False
+        self._wrong_s = 0.0
+        self._near = False
+        """Whether the error was within the bound of the law once: a start from afar is not behind."""
+        self._tilt_cosine = math.cos(vehicle.limits.tilt_max_rad)
+        self._envelope: Envelope | None = None
+        if parameters is not None:
+            self.retune(parameters)
+
+    def retune(self, parameters: Parameters) -> None:
+        """Other gains are flown from now on."""
+        self._envelope = Envelope(parameters.gains, parameters.model.drag, disturbance_step(self._limits))
+
+    def restart(self) -> None:
+        """The flight begins anew for the guards of the errors: the estimate was reset."""
+        if self._envelope is not None:
+            self._envelope.restart()
+
+    def step(self, q: Quat, error: Vec3, numbers: tuple[float, ...], now_s: float) -> Finding | None:
+        """Judges a control step.
 
         Args:
             q: attitude.
             error: position less reference, NED [m].
+            numbers: of the step (`control.flat`).
+            now_s: vehicle time [s].
+
+        Returns:
+            what is to be done now, the hardest of several.
+        """
+        limits, flags = self._limits, int(numbers[flat.LIMITS])
+        found: Finding | None = None
+        size = math.hypot(*error)
+        broken = size > limits.position_error_abort_m
+        if broken or Guard.POSITION_ERROR in self._since:
+            found = self._judge(Guard.POSITION_ERROR, broken, size, limits.position_error_abort_m, "m", now_s)
+        _, x, y, _ = q
+        if 1.0 - 2.0 * (x * x + y * y) < self._tilt_cosine or Guard.TILT in self._since:
+            tilt = tilt_from_quat(q)
+            found = _harder(
+                found, self._judge(Guard.TILT, tilt > limits.tilt_max_rad, tilt, limits.tilt_max_rad, "rad", now_s)
+            )
+        bound = self._vehicle.controller.position_error_max_m
+        self._near = self._near or size < bound
+        if flags or size > bound or self._since:
+            found = _harder(found, self._strained(flags, size, numbers, now_s))
+        if self._envelope is not None:
+            excess = self._envelope.excess(numbers, now_s)
+            if excess is not None:
+                value, most, part = excess
+                detail = f"V_H ({part}) {value:.3g} m^2, envelope {most:.3g} m^2"
+                found = _harder(found, self._broken(Guard.LYAPUNOV, detail, now_s))
+            elif Guard.LYAPUNOV in self._since:
+                self._clear(Guard.LYAPUNOV)
+        return found
+
+    def _strained(self, flags: int, size: float, numbers: tuple[float, ...], now_s: float) -> Finding | None:
+        """Saturation, and an error beyond what the law reacts to."""
+        limits, bound = self._limits, self._vehicle.controller.position_error_max_m
+        found = self._judge(Guard.BEHIND, self._near and size > bound, size, bound, "m", now_s)
+        disturbance = math.hypot(*numbers[flat.B_HAT])
+        for guard, mask, value, limit, unit in (
+            (Guard.DISTURBANCE, LIMIT_DISTURBANCE, disturbance, limits.disturbance_max_m_s2, "m/s^2"),
+            (Guard.THRUST, _THRUST, numbers[flat.THRUST], limits.thrust_max_n, "N"),
+            (Guard.RATES, _RATES, max(map(abs, numbers[flat.RATES])), max(limits.rate_max_rad_s), "rad/s"),
+        ):
+            found = _harder(found, self._judge(guard, bool(flags & mask), value, limit, unit, now_s))
+        return found
+
+    def slowly(self, seen: Slow, now_s: float) -> Finding | None:
+        """Judges what changes slowly; ten times per second.
+
+        Args:
+            seen: what is known.
             now_s: vehicle time [s].
         """
-        limits = self._limits
-        size = math.hypot(*error)
-        if size > limits.position_error_abort_m:
-            limit = f"limit {limits.position_error_abort_m:g} m (limits.position_error_abort_m)"
-            return Cause.POSITION_ERROR, f"{size:.2f} m, {limit}"
-        tilt = tilt_from_quat(q)
-        if tilt <= limits.tilt_max_rad:
-            self._tilted_since_s = None
-        elif self._tilted_since_s is None:
-            self._tilted_since_s = now_s
-        elif now_s - self._tilted_since_s > TILT_FOR_S:
-            limit = f"limit {limits.tilt_max_rad:g} rad (limits.tilt_max_rad)"
-            return Cause.TILT, f"{tilt:.2f} rad for {TILT_FOR_S:g} s, {limit}"
-        return None
+        limits, vehicle = self._limits, self._vehicle
+        rate_min = limits.state_rate_min * vehicle.link.state_rate_hz
+        age_max, silence_max = vehicle.state_age_max_s, limits.link_silence_max_s
+        found: Finding | None = None
+        for guard, value, limit, unit, below in (
+            (Guard.STATE_RATE, seen.state_rate_hz, rate_min, "Hz", True),
+            (Guard.STATE_AGE, seen.state_age_s, age_max, "s", False),
+            (Guard.LATE_STEPS, seen.late_share, limits.late_steps_max, "of the steps", False),
+            (Guard.BATTERY, seen.battery, limits.battery_min, "of the charge", True),
+            (Guard.BATTERY_CRITICAL, seen.battery, BATTERY_CRITICAL * limits.battery_min, "of the charge", True),
+            (Guard.LINK, seen.unanswered_s, silence_max, "s without an answer", False),
+        ):
+            broken = value is not None and (value < limit if below else value > limit)
+            found = _harder(found, self._judge(guard, broken, value or 0.0, limit, unit, now_s))
+        for guard, words in (
+            (Guard.ESTIMATOR, ", ".join(seen.estimator)),
+            (Guard.FENCE, seen.fence),
+            (Guard.FAILSAFE, seen.failsafe),
+        ):
+            if words:
+                found = _harder(found, self._broken(guard, words, now_s))
+            else:
+                self._clear(guard)
+        return found or self._ease(now_s)
+
+    def _judge(self, guard: Guard, broken: bool, value: float, limit: float, unit: str, now_s: float) -> Finding | None:
+        if not broken:
+            self._clear(guard)
+            return None
+        return self._broken(guard, f"{value:.3g} {unit}, limit {limit:.3g} ({guard.value.key})", now_s)
+
+    def _broken(self, guard: Guard, detail: str, now_s: float) -> Finding | None:
+        """The response that is due, once per stage."""
+        begun_s = self._since.setdefault(guard, now_s)
+        self._wrong_s = now_s
+        stages, answered = guard.value.stages, self._answered.get(guard, 0)
+        due = [stage for stage in stages[answered:] if now_s - begun_s >= stage.after_s]
+        if not due:
+            return None
+        self._answered[guard] = answered + len(due)
+        response = due[-1].response
+        self._slowed = self._slowed or response is Response.SLOW
+        lasted = f" for {now_s - begun_s:.1f} s" if due[-1].after_s > 0.0 else ""
+        return Finding(guard, response, detail + lasted)
+
+    def _clear(self, guard: Guard) -> None:
+        if guard in self._since:
+            del self._since[guard]
+            self._answered.pop(guard, None)
+
+    def _ease(self, now_s: float) -> Finding | None:
+        if not self._slowed or self._since or now_s - self._wrong_s < EASY_S:
+            return None
+        self._slowed = False
+        return Finding(None, Response.RESUME, f"nothing was wrong for {EASY_S:g} s")
 
 
-def coast_setpoint(flight: Flight, q: Quat) -> Setpoint:
-    """No rotation, and hover thrust over the cosine of the tilt, clipped: what keeps height and attitude for a moment.
+def _harder(a: Finding | None, b: Finding | None) -> Finding | None:
+    if a is None or b is None:
+        return a or b
+    return b if b.response > a.response else a
 
-    Where PX4's own position controller follows the setpoints it is to stop: it has a state when we have none, but would
-    fly on with the last velocity as feed-forward.
 
-    Args:
-        flight: gives weight, limits and the kind of output.
-        q: the last known attitude.
-    """
-    if flight.output.sends == "position":
-        return PositionSetpoint(None, (0.0, 0.0, 0.0), None, None, None)
-    vehicle, limits = flight.vehicle, flight.vehicle.limits
-    cosine = max(axes(q)[2][2], COSINE_MIN)
-    thrust_n = min(max(vehicle.body.mass_kg * GRAVITY_M_S2 / cosine, limits.thrust_min_n), limits.thrust_max_n)
-    thrust = thrust_fraction(thrust_n, vehicle.thrust_full_n, vehicle.rotors.curve_factor)
-    if flight.output.kind == "attitude":
-        return AttitudeSetpoint(thrust, q, 0.0)
-    if flight.output.kind == "actuators":
-        return ActuatorSetpoint(thrust, (0.0, 0.0, 0.0))
-    return RateSetpoint(thrust, (0.0, 0.0, 0.0))
+def disturbance_step(limits: FlightLimits) -> tuple[float, float]:
+    """The disturbance step that a flight must bear, horizontal and vertical [m/s^2]."""
+    horizontal = limits.disturbance_step_m_s2
+    return limits.disturbance_max_m_s2 if horizontal is None else horizontal, limits.disturbance_step_vertical_m_s2

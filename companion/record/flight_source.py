@@ -23,7 +23,7 @@ from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, read_summary
 from companion.record.summary import FlightMeta, PhaseChange, note_end, summarise
-from companion.record.ulog import ULOG_FILE, Level
+from companion.record.ulog import ULOG_FILE, Level, Topic
 from companion.record.ulog_file import Array, LogFile, read_ulog
 
 TRUTH_FILE: Final = "truth.csv"
@@ -137,8 +137,8 @@ def _from_log(path: Path) -> FlightSource:
     outcome = _json_object(log, "outcome", {"sentence", "cause", "rejected_states"})
     if not outcome:
         missing.append("the log does not have the flight's end: the program was killed, or the rest of the log is lost")
-    dropped = log.topics.get(topics.LINK.name, {}).get("dropped", [])
-    if len(dropped) and dropped[-1]:
+    dropped = log.topics[topics.LINK.name].get("dropped") if topics.LINK.name in log.topics else None
+    if dropped is not None and dropped[-1]:
         missing.append(f"{dropped[-1]} entries never reached the log: its writer was too slow")
     summary = _summary(log, record, configuration, outcome)
     return FlightSource(path, record, summary, configuration, f"{path} (flight_toml)", missing=tuple(missing))
@@ -168,7 +168,7 @@ def _record(log: LogFile, missing: list[str]) -> FlightRecord:
     return record
 
 
-def _fill(table: Array, log: LogFile, topic: topics.Topic, stamps: Any) -> Any:
+def _fill(table: Array, log: LogFile, topic: Topic, stamps: Any) -> Any:
     """Put a topic's numbers into the rows with their timestamps; a row that the topic lost stays NaN.
 
     Returns which rows it has, shape (len,).

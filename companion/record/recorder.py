@@ -110,6 +110,16 @@ class Recorder:
             start_new_session=True,
         )
 
+    @property
+    def pid(self) -> int:
+        """Of the child."""
+        return self._process.pid
+
+    @property
+    def behind(self) -> int:
+        """Entries that the child has not taken yet."""
+        return self._writer.put_count - self._writer.taken
+
     def offer(self, direction: int, raw: bytes, wall_ns: int) -> None:
         """Hand over one datagram (on a serial line: whole frames). Never blocks, never raises for a lost one.
 

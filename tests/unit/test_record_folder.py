@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.cli import main
 from companion.errors import ExitCode, InputError
 from companion.record.folder import create_flight_folder, read_summary, write_configuration, write_summary
 
@@ -50,6 +51,18 @@ def test_a_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path):
         assert "--out" in str(caught.value)
         assert "\n" not in str(caught.value)
         assert caught.value.exit_code == ExitCode.BAD_INPUT
+
+
+@pytest.mark.parametrize("command", [["demo", "--flight", "eight"], ["fly", "circle", "--vehicle", "bundled"]])
+def test_a_flight_without_a_place_to_write_is_refused_before_anything_starts(command, monkeypatch, capsys):
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError("the flight began")
+
+    monkeypatch.setattr("companion.flight.bundled.BundledVehicle", begun)
+    monkeypatch.setattr("companion.flight.launch.control", begun)
+    assert main([*command, "--controller", "px4", "--out", "/proc/flight"]) == ExitCode.BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("companion: /proc/flight: cannot write the flight's folder")
 
 
 def test_summary_round_trip_keeps_order_and_digits(tmp_path):

@@ -267,7 +267,8 @@ def small_disk(tmp_path) -> Iterator[Path]:
     mount, umount = shutil.which("mount"), shutil.which("umount")
     if os.geteuid() != 0 or mount is None or umount is None:
         pytest.skip("only root can mount a small file system")
-    made = subprocess.run([mount, "-t", "tmpfs", "-o", "size=256k", "none", str(place)], capture_output=True, check=False)
+    command = [mount, "-t", "tmpfs", "-o", "size=256k", "none", str(place)]
+    made = subprocess.run(command, capture_output=True, check=False)
     if made.returncode:
         pytest.skip("no small file system can be mounted here")
     yield place

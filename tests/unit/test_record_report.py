@@ -15,6 +15,7 @@ from companion.record.charts import thin
 from companion.record.compare import build_comparison, table
 from companion.record.figures import FIGURES
 from companion.record.flight_record import FlightRecord
+from companion.record.flight_source import FlightSource
 from companion.record.folder import write_configuration, write_summary
 from companion.record.report import build_report
 from companion.record.summary import FlightMeta, PhaseChange, summarise
@@ -220,7 +221,8 @@ def test_ten_minutes_at_250_hz_stay_small_and_keep_their_peaks(tmp_path, record)
     spikes = {"error_n": 77_777, "thrust_n": 123_456, "step_us": 9, "w_x": 149_990}
     for column, at in spikes.items():
         long.column(column)[at] = 5e4
-    path = build_report(fill(tmp_path, long))
+    summary = summarise(long, PHASES, FlightMeta("paper", "quad"))
+    path = build_report(FlightSource(tmp_path, long, summary, {}, "none"))
     assert path.stat().st_size < 8_000_000
     page = Page(path)
     for (key, name, axis), scale in {
