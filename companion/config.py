@@ -75,9 +75,6 @@ class Link(Section):
     state_rate_hz: Annotated[float, Field(ge=10.0, le=1000.0)]
     state_age_s: Annotated[float, Field(ge=0.0, le=0.5)]
     command_delay_s: Annotated[float, Field(ge=0.0, le=0.5)]
-    measure_age: bool = True
-    """Whether the prediction goes by the measured age of the states; false where the two above are only known
-    together, as one delay."""
 
 
 class Noise(Section):
@@ -112,6 +109,9 @@ class Controller(Section):
     rate_lag_inversion: bool = True
     thrust_lag_compensation: bool = True
     prediction: bool = True
+    measured_delay: bool = True
+    """Whether the prediction goes by the measured age of the states; false where link.state_age_s and command_delay_s
+    are only known together, as one delay."""
 
 
 class FlightLimits(Section):

@@ -117,6 +117,8 @@ def replay(
         course.change_pace(ramp)
     tracker = controller_of(flight, engine)
     ways = list(engagement.transitions) if changed is None else []  # other gains are compared as they stand
+    delays = list(engagement.delays) if changed is None else []
+    resets = list(engagement.resets)
     rows = record.rows
     begin_s = engagement.at_s
     tracker.begin(State(ZERO, ZERO, engagement.attitude, ZERO), engagement.thrust_n)
@@ -127,6 +129,11 @@ def replay(
         if ways and stamp_s >= ways[0].begin_s and isinstance(tracker, Tracker):
             way = ways.pop(0)
             tracker.retune(way.new, way.duration_s)
+        if delays and stamp_s >= delays[0][0] and isinstance(tracker, Tracker):
+            tracker.retime(delays.pop(0)[1])
+        while resets and stamp_s >= resets[0].at_s:
+            course.shift(resets[0].moved_m)
+            tracker.carry(resets.pop(0))
         out = tracker.step(stamp_s, state, lambda t: course.at(t - begin_s))
         n = out.numbers
         values = (thrust_of(out.setpoint), n[flat.TOTAL], *n[flat.RATES], *n[flat.TAU], *n[flat.B_HAT])

@@ -16,7 +16,9 @@ import math
 from companion.config import Vehicle
 from companion.control import flat
 from companion.control.output import PositionSetpoint
-from companion.control.types import Reference, State
+from companion.control.types import GRAVITY_M_S2, Reference, State
+from companion.control.vectors import quat_exp, quat_multiply
+from companion.flight.resets import Reset
 from companion.flight.tracker import ReferenceAt, TrackerStep
 from companion.frames import wrap_angle, yaw_from_quat
 
@@ -43,6 +45,7 @@ class Px4Baseline:
         self._turn_max_rad_s = vehicle.limits.heading_rate_max_rad_s
         self._interval_s = 1.0 / vehicle.link.state_rate_hz
         self._last_s: float | None = None
+        self._seen: State | None = None
         self._yaw = 0.0
         self._held = True
 
@@ -62,7 +65,7 @@ class Px4Baseline:
             frozen: means nothing here.
         """
         dt_s = self._interval_s if self._last_s is None else max(stamp_s - self._last_s, 0.0)
-        self._last_s = stamp_s
+        self._last_s, self._seen = stamp_s, state
         reference = reference_at(stamp_s + self.delay_s)
         yaw, yaw_rate, error = None, None, math.nan
         if self._heading != "damping":
@@ -70,6 +73,20 @@ class Px4Baseline:
             error = wrap_angle(yaw_from_quat(state.q) - (yaw - yaw_rate * self.delay_s))  # at the state's stamp
         setpoint = PositionSetpoint(reference.p, reference.v, reference.a, yaw, yaw_rate)
         return TrackerStep(setpoint, (*_BEFORE_HEADING, error, *_AFTER_HEADING))
+
+    def foresee(self, stamp_s: float) -> tuple[State, float] | None:
+        """The last state, moved on as it was; and the thrust of a hover over the mass [m/s^2]."""
+        if self._last_s is None or self._seen is None:
+            return None
+        dt = stamp_s - self._last_s
+        (x, y, z), (vx, vy, vz) = self._seen.p, self._seen.v
+        rates = self._seen.w
+        q = quat_multiply(self._seen.q, quat_exp((dt * rates[0], dt * rates[1], dt * rates[2])))
+        return State((x + dt * vx, y + dt * vy, z + dt * vz), self._seen.v, q, rates), GRAVITY_M_S2
+
+    def carry(self, reset: Reset) -> None:
+        """Goes on after a reset of the autopilot's estimate: a heading that is held turns along."""
+        self._yaw = wrap_angle(self._yaw + reset.turned_rad)
 
     def _wanted(self, reference: Reference) -> tuple[float, float]:
         """Heading and heading rate that the reference asks for."""

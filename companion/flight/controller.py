@@ -7,6 +7,7 @@ from typing import Protocol
 from companion.config import Flight
 from companion.control.types import State
 from companion.flight.baseline import Px4Baseline
+from companion.flight.resets import Reset
 from companion.flight.tracker import Kernels, ReferenceAt, Tracker, TrackerStep
 
 
@@ -31,6 +32,15 @@ class Controller(Protocol):
             reference_at: the reference as a function of vehicle time [s].
             frozen: hold what is estimated still.
         """
+        ...
+
+    def foresee(self, stamp_s: float) -> tuple[State, float] | None:
+        """The state at a stamp, from the last one and the commands since, and the thrust over the mass [m/s^2]; None
+        before the first state."""
+        ...
+
+    def carry(self, reset: Reset) -> None:
+        """Goes on after a reset of the autopilot's estimate as if nothing had happened."""
         ...
 
 

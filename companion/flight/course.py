@@ -83,6 +83,8 @@ class Course:
         self.stop_s = stopping.duration_s
         self._chain = chain([*pieces, path, stopping])
         self._tempo = Tempo()
+        self.moved_m: Vec3 = ZERO
+        """By how much it was moved since it was planned, NED: its hold point, path and home do not show it."""
 
     @property
     def duration_s(self) -> float:
@@ -92,9 +94,19 @@ class Course:
     def at(self, t_s: float) -> Reference:
         """The reference, `t_s` after engaging; before 0 the start, after the end the point of rest."""
         if self._tempo.steady:
-            return self._at_own_pace(t_s)
-        pace = self._tempo.at(t_s)
-        return paced(self._at_own_pace(pace[0]), pace)
+            reference = self._at_own_pace(t_s)
+        else:
+            pace = self._tempo.at(t_s)
+            reference = paced(self._at_own_pace(pace[0]), pace)
+        if self.moved_m is ZERO:
+            return reference
+        (x, y, z), (dx, dy, dz) = reference.p, self.moved_m
+        return reference._replace(p=(x + dx, y + dy, z + dz))
+
+    def shift(self, by_m: Vec3) -> None:
+        """Moves all of it (NED): after the autopilot's estimate has jumped by as much."""
+        (x, y, z), (dx, dy, dz) = self.moved_m, by_m
+        self.moved_m = (x + dx, y + dy, z + dz)
 
     def _at_own_pace(self, course_s: float) -> Reference:
         on_track_s = course_s - self.join_s
@@ -124,14 +136,14 @@ class Course:
         settled_s = tempo.settled_s
         if tempo.resting(settled_s):
             return settled_s
-        return settled_s + max(0.0, self.duration_s - self.course_s(settled_s))
+        return settled_s + max(0.0, self.duration_s - self.course_s(settled_s)) / tempo.rate
 
     def plan_pace(self, begin_s: float, rate: float) -> RampPlan:
         """Begins to look for a change of pace; see `RampPlan`.
 
         Args:
             begin_s: when it is to begin, far enough ahead [s since engaging].
-            rate: 0 to come to rest, 1 to go on.
+            rate: 0 to come to rest, 1 to go on, between the two slowly.
         """
         return RampPlan(self._tempo, _OwnPace(self), begin_s, rate, self._limits, self._model)
 

@@ -30,12 +30,14 @@ class Delay:
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
+        self.file_s = vehicle.delay_s
+        """What the vehicle file says [s]."""
         self.used_s = vehicle.delay_s
         """What the prediction uses [s]."""
         self.age_s: float | None = None
         """How old states are when they come, smoothed [s]; None: nobody knows."""
         link = vehicle.link
-        self._follows = link.measure_age and vehicle.controller.prediction
+        self._follows = vehicle.controller.measured_delay and vehicle.controller.prediction
         self._command_s = link.command_delay_s
         self._low_s = max(vehicle.delay_s - CHANGE_MAX_S, link.command_delay_s)
         self._high_s = vehicle.delay_s + CHANGE_MAX_S

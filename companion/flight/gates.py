@@ -91,8 +91,8 @@ def mode(m: Measured) -> Finding:
         sentence = f"setpoints have ceased before: a failsafe flies {now.label}"
         return warning(gate, now.label, limit, sentence, "Hold will be asked for first")
     if now in DOWN:
-        sentence = f"the vehicle is in {now.label}: somebody wants it down"
-        return refused(gate, now.label, limit, sentence, "change to Hold first")
+        sentence = f"the vehicle is in {now.label}: somebody wanted it down"
+        return warning(gate, now.label, limit, sentence, "Hold will be asked for first")
     if now != modes.HOLD:
         return warning(gate, now.label, limit, f"the vehicle flies {now.label}", "Hold will be asked for first")
     return passed(gate, now.label, limit, "the vehicle holds in the air")

@@ -126,8 +126,9 @@ def loss_action(m: Measured) -> Finding:
     if action is None:
         return refused(gate, "unknown", limit, "parameter COM_OBL_RC_ACT is not known", fix)
     shown = f"COM_OBL_RC_ACT {action:g}"
-    if silence.reaction.falls or silence.without_sticks.falls:
-        return refused(gate, shown, limit, f"parameter {shown}: {silence.sentence}", fix)
+    if silence.without_sticks.falls:  # sticks may be lost together with this companion
+        worst = when_silent(m.autopilot.parameters, sticks=False)
+        return refused(gate, shown, limit, f"parameter {shown}: {worst.sentence}", fix)
     if action in {0.0, 1.0, 2.0}:
         other = "unknown" if fallback is None else f"{fallback:g}"
         both = f"parameters COM_OBL_RC_ACT {action:g} and NAV_RCL_ACT {other}"

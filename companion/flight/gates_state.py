@@ -16,6 +16,8 @@ RATE_FLOOR: Final = 0.8
 JITTER_WANTED_S: Final = 0.010
 GAPS_MAX: Final = 2
 """Of a measurement; the machine may have been busy once."""
+LONG_GAP: Final = 5.0
+"""Over the time that a flight waits for a state: such a gap is no busy machine."""
 REJECTED_MAX: Final = 0.02
 """Share of the states."""
 TEST_RATIO_MAX: Final = 1.0
@@ -51,7 +53,7 @@ def state_age(m: Measured) -> Finding:
     """States are no older than the loop was certified for."""
     gate, age = Gate.STATE_AGE, m.link.age_s
     assumed = m.flight.vehicle.link.state_age_s
-    most = assumed + DELAY_MARGIN_MIN_S
+    most = assumed + DELAY_MARGIN_MIN_S + _paced_s(m)
     limit = f"at most {most * 1e3:.0f} ms"
     if age is None:
         return _unmeasured(gate, limit)
@@ -84,7 +86,7 @@ def state_gaps(m: Measured) -> Finding:
     """No gaps that would end a flight."""
     gate, link = Gate.STATE_GAPS, m.link
     most = silence_limit_s(m.flight.vehicle.link.state_rate_hz)
-    limit = f"at most {GAPS_MAX} above {most * 1e3:.0f} ms"
+    limit = f"at most {GAPS_MAX} above {most * 1e3:.0f} ms, none above {LONG_GAP * most * 1e3:.0f} ms"
     if link.longest_gap_s is None:
         return _unmeasured(gate, limit)
     shown = f"{link.gaps}, longest {link.longest_gap_s * 1e3:.0f} ms"
@@ -92,7 +94,8 @@ def state_gaps(m: Measured) -> Finding:
     if link.gaps:
         sentence += f", a flight ends after {most * 1e3:.0f} ms"
         fix = "look for what stops the link or this machine for so long"
-        return (refused if link.gaps > GAPS_MAX else warning)(gate, shown, limit, sentence, fix)
+        grave = link.gaps > GAPS_MAX or link.longest_gap_s > LONG_GAP * most
+        return (refused if grave else warning)(gate, shown, limit, sentence, fix)
     return passed(gate, shown, limit, sentence)
 
 
@@ -113,9 +116,7 @@ def state_sound(m: Measured) -> Finding:
 def round_trip(m: Measured) -> Finding:
     """Commands arrive as soon as the loop was certified for: half of a round trip is theirs."""
     gate, link, delay_s = Gate.ROUND_TRIP, m.link, m.flight.vehicle.link.command_delay_s
-    most = 2.0 * (delay_s + DELAY_MARGIN_MIN_S)
-    if link.paced:  # a request of ours counts at the next state
-        most += 1.0 / m.flight.vehicle.link.state_rate_hz
+    most = 2.0 * (delay_s + DELAY_MARGIN_MIN_S) + _paced_s(m)
     limit = f"at most {most * 1e3:.0f} ms"
     if link.round_trip_s is None:
         sentence = "the vehicle does not answer TIMESYNC: how long commands take is not known"
@@ -195,6 +196,11 @@ def estimator_resets(m: Measured) -> Finding:
         sentence = "the estimate jumped while it was watched (its reset counter changed)"
         return refused(gate, shown, limit, sentence, "wait until the estimator has settled")
     return passed(gate, shown, limit, "the estimate did not jump while it was watched")
+
+
+def _paced_s(m: Measured) -> float:
+    """In lockstep whatever is late comes with the next state: so much later [s]."""
+    return 1.0 / m.flight.vehicle.link.state_rate_hz if m.link.paced else 0.0
 
 
 def _unmeasured(gate: Gate, limit: str) -> Finding:

@@ -45,7 +45,7 @@ class Response(IntEnum):
     REST = 2
     """The reference comes to rest on its path, then the autopilot gets the vehicle in Hold."""
     HOLD = 3
-    """The autopilot gets the vehicle in Hold at once; where it refuses, it is to land, and then nothing more is sent."""
+    """The autopilot gets the vehicle in Hold at once; where it refuses it is to land. Then nothing more is sent."""
     LAND = 4
     """The autopilot is to land the vehicle at once."""
 
@@ -86,9 +86,7 @@ class Guard(Enum):
         *(Cause.RATES, "limits.rate_max_rad_s"),
         (Stage(1.0, Response.SLOW), Stage(3.0, Response.REST), Stage(6.0, Response.HOLD)),
     )
-    STATE_RATE = Rule(
-        Cause.STATE_RATE, "limits.state_rate_min", (Stage(0.5, Response.SLOW), Stage(2.0, Response.HOLD))
-    )
+    STATE_RATE = Rule(Cause.STATE_RATE, "limits.state_rate_min", (Stage(0.5, Response.SLOW), Stage(2.0, Response.HOLD)))
     STATE_AGE = Rule(Cause.STATE_AGE, "limits.state_age_max_s", (Stage(0.3, Response.SLOW), Stage(1.0, Response.HOLD)))
     LATE_STEPS = Rule(Cause.LATE_STEPS, "limits.late_steps_max", (Stage(1.0, Response.SLOW), Stage(5.0, Response.REST)))
     ESTIMATOR = Rule(Cause.ESTIMATOR, "ESTIMATOR_STATUS", (Stage(0.5, Response.HOLD),))
@@ -200,7 +198,8 @@ class Guards:
     def _strained(self, flags: int, size: float, numbers: tuple[float, ...], now_s: float) -> Finding | None:
         """Saturation, and an error beyond what the law reacts to."""
         limits, bound = self._limits, self._vehicle.controller.position_error_max_m
-        found = self._judge(Guard.BEHIND, self._near and size > bound, size, bound, "m", now_s)
+        behind = self._envelope is not None and self._near and size > bound  # the bound is the law's
+        found = self._judge(Guard.BEHIND, behind, size, bound, "m", now_s)
         disturbance = math.hypot(*numbers[flat.B_HAT])
         for guard, mask, value, limit, unit in (
             (Guard.DISTURBANCE, LIMIT_DISTURBANCE, disturbance, limits.disturbance_max_m_s2, "m/s^2"),

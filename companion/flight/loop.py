@@ -23,20 +23,23 @@ from companion.control.output import Setpoint
 from companion.control.types import Quat, State, Vec3
 from companion.errors import LinkError
 from companion.flight.clock import VehicleClock
+from companion.flight.coast import coast_setpoint
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
 from companion.flight.controller import controller_of
 from companion.flight.course import Course, at_rest
-from companion.flight.guards import Guards, coast_setpoint
 from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
 from companion.flight.measure import silence_limit_s
 from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
+from companion.flight.prediction import Attitude
 from companion.flight.preflight import Preflight
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
+from companion.flight.responses import respond
 from companion.flight.retuning import ParameterChange, Retuning
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
 from companion.flight.tracker import Kernels, Tracker, TrackerStep
+from companion.flight.watch import Seen, Watch
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
@@ -185,7 +188,7 @@ class FlightLoop:
         self._unaccounted: _Step | None = None
         self._engagement: Engagement | None = None
         self._sent_ns = 0
-        self._guards = Guards(flight.vehicle.limits)
+        self._watch = Watch(flight, self._tracker, self._autopilot, notify)
         self._heartbeat_s = -math.inf
         self._progress_ns = 0
         self._requests: list[tuple[Timesync, Frame]] = []
@@ -254,7 +257,10 @@ class FlightLoop:
         rejected = {reason.name: n for reason, n in self._telemetry.rejected.items() if n}
         read = dict(self._autopilot.parameters)
         self._keep_ramps()
-        return Outcome(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement)
+        figures = self._watch.delay_figures() if self._engagement is not None else {}
+        return Outcome(
+            *(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement, figures)
+        )
 
     def _fly(self) -> tuple[Cause, str]:
         try:
@@ -369,6 +375,8 @@ class FlightLoop:
             self._on_odometry(frame)
         elif msgid == codec.TIMESYNC:
             self._on_timesync(frame)
+        elif msgid == codec.ATTITUDE_QUATERNION and isinstance(self._tracker, Tracker):
+            self._on_attitude(frame, self._tracker)
         else:
             if msgid == codec.HEARTBEAT:
                 take_heartbeat(self._autopilot, frame)
@@ -394,6 +402,12 @@ class FlightLoop:
         meter = self._sequence.preflight.meter
         if meter.running:
             meter.on_state(state, self._clock.now_s(frame.arrival_wall_ns), paced=self._peer.paced)
+
+    def _on_attitude(self, frame: Frame, tracker: Tracker) -> None:
+        """One that is newer than the state which is answered next refreshes the prediction, and asks for no answer."""
+        sample = self._telemetry.on_attitude(frame)
+        if not (self._peer.paced or isinstance(sample, StateRejection)):
+            tracker.refresh(Attitude(sample.t_vehicle_us * 1e-6, sample.q, sample.w))
 
     def _on_timesync(self, frame: Frame) -> None:
         """A request is answered after the setpoint for the state that came before it."""
@@ -421,6 +435,8 @@ class FlightLoop:
     def _on_time_told(self, message: Timesync, wall_ns: int) -> None:
         """An answer to a request of ours."""
         if timesync.is_response(message, self._wire.system_id, self._wire.component_id):
+            if self._watch.offset.on_answer(message, wall_ns) and self._engagement is None:
+                self._watch.offset.settle()
             self._sequence.preflight.meter.on_answer(message, self._clock.now_s(wall_ns))
 
     def _answer_requests(self) -> None:
@@ -440,6 +456,8 @@ class FlightLoop:
         if now_s - self._heartbeat_s >= HEARTBEAT_INTERVAL_S:
             self._heartbeat_s = now_s
             send_heartbeat(self._wire)
+        if not self._peer.paced and self._watch.asks_time(wall_ns):
+            self._ops.ask_time(wall_ns)
         # A better estimate of the vehicle's clock is no silence: only a vehicle in lockstep is judged by its own time.
         silent_s = now_s - self._last_state_s if self._peer.paced else (wall_ns - self._last_arrival_ns) * 1e-9
         if sequence.duty is not Duty.NOTHING and silent_s > self._silence_s:
@@ -468,11 +486,9 @@ class FlightLoop:
         sequence.on_state(state, now_s)
         if sequence.duty is Duty.NOTHING:
             return
-        if before is not None and before.reset_counter != state.reset_counter:
-            moved = math.dist(before.p, state.p)
-            detail = f"reset counter {state.reset_counter}, moved by {moved:.2f} m"
-            self._stop_answering(Cause.ESTIMATE_JUMPED, detail, now_s)
-        elif self._silent_too_long(state):
+        if before is not None and before.reset_counter != state.reset_counter and not self._carry(state, now_s):
+            return
+        if self._silent_too_long(state):
             assert self._sent_us is not None
             sequence.duty = Duty.NOTHING
             detail = f"none for {(state.t_vehicle_us - self._sent_us) * 1e-6:.2f} s of vehicle time"
@@ -482,6 +498,15 @@ class FlightLoop:
         else:
             self._lost += skipped
             self._track(state, skipped, arrival_ns)
+
+    def _carry(self, state: VehicleState, now_s: float) -> bool:
+        """The autopilot's estimate was reset: the reference moves along. False: by too much, the flight ends."""
+        assert self._sequence.course is not None
+        problem = self._watch.on_reset(state, self._sequence.course)
+        if problem:
+            detail = f"{problem}, reset counter {state.reset_counter}"
+            self._stop_answering(Cause.ESTIMATE_JUMPED, detail, now_s)
+        return not problem
 
     def _silent_too_long(self, state: VehicleState) -> bool:
         """After more than half of COM_OF_LOSS_T PX4 may be about to leave OFFBOARD, and would come back at the next
@@ -505,6 +530,7 @@ class FlightLoop:
         course = self._sequence.course
         assert course is not None
         begin_s = self._sequence.engaged_at_s
+        self._watch.begin()
         self._engagement = Engagement(begin_s, course.hold_point, course.yaw_rad, course.home, state.q, thrust_n)
         self._engaged(self._engagement)
 
@@ -513,9 +539,12 @@ class FlightLoop:
         engagement, course = self._engagement, self._sequence.course
         if engagement is None or course is None:
             return
-        ways = tuple(self._tracker.transitions) if isinstance(self._tracker, Tracker) else ()
-        if engagement.ramps != course.ramps or len(engagement.transitions) != len(ways):
-            self._engagement = replace(engagement, ramps=course.ramps, transitions=ways)
+        law = self._tracker if isinstance(self._tracker, Tracker) else None
+        ways, delays = ((), ()) if law is None else (tuple(law.transitions), tuple(law.delays))
+        resets = tuple(self._watch.resets.carried)
+        before = engagement.ramps, len(engagement.transitions), len(engagement.resets), len(engagement.delays)
+        if before != (course.ramps, len(ways), len(resets), len(delays)):
+            self._engagement = replace(engagement, ramps=course.ramps, transitions=ways, resets=resets, delays=delays)
             self._engaged(self._engagement)
 
     def _track(self, state: VehicleState, skipped: int, arrival_ns: int) -> None:
@@ -545,9 +574,10 @@ class FlightLoop:
         self._record.append(row)
         if self._retuning is not None:
             self._retuning.tick()
-        finding = self._guards.check(state.q, error, self._last_state_s)
+        seen = Seen(state, error, step.out, step.skipped, timing.late, self._age_of(state, step), self._peer.paced)
+        finding = self._watch.on_step(seen, step.course, self._last_state_s)
         if finding is not None:
-            self._sequence.end(*finding, self._last_state_s)
+            respond(self._sequence, finding, self._last_state_s)
         if sent_ns - self._progress_ns > PROGRESS_NS:
             self._progress_ns = sent_ns
             self._progress(self._standing(step, reference.p, math.hypot(*error), timing.age_ms))
@@ -573,6 +603,12 @@ class FlightLoop:
             state_age_ms=age_ms,
             battery=self._autopilot.battery,
         )
+
+    def _age_of(self, state: VehicleState, step: _Step) -> float | None:
+        """How old the state was at its arrival [s]."""
+        if self._timesync_at_ns is not None:
+            return (self._timesync_at_ns - state.t_vehicle_us * 1000) * 1e-9
+        return self._watch.age_s(state.t_vehicle_us, step.arrival_ns)
 
     def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:
         took_ns = sent_ns - arrival_ns

@@ -37,6 +37,8 @@ class Orders:
         self._pacing: Pacing | None = None
         self._given: list[Order] = []
         self._going_on = False
+        self._pace = 1.0
+        """Of the course while nobody asks for rest."""
 
     def follow(self, course: Course) -> None:
         """From now on the controller follows this course."""
@@ -93,7 +95,7 @@ class Orders:
         on_course = pacing is not None and sequence.phase in _ON_COURSE
         if order is Order.RESUME and pacing is not None and sequence.phase is Phase.PAUSE:
             self._going_on = True
-            pacing.want(1.0, self._t_s)
+            pacing.want(self._pace, self._t_s)
         elif order is Order.PAUSE and pacing is not None and on_course:
             self._going_on = False
             pacing.want(0.0, self._t_s)
@@ -106,6 +108,39 @@ class Orders:
                 sequence.enter(Phase.HOLD, now_s, f"the operator ends the flight ({order.value})")
             elif sequence.phase is not Phase.HOLD:
                 self._end_before(order, now_s)
+
+    # -- guards -------------------------------------------------------------------------------------------------
+
+    def set_pace(self, pace: float, why: str) -> None:
+        """The course is to be flown at this share of its own pace; a pause or an end goes before.
+
+        Args:
+            pace: above 0, at most 1.
+            why: for people.
+        """
+        if pace == self._pace or self._pacing is None:
+            return
+        self._pace = pace
+        phase = self._sequence.phase
+        if phase in {Phase.JOIN, Phase.TRACK} or (phase is Phase.PAUSE and self._going_on):
+            self._pacing.want(pace, self._t_s)
+            how = "gets its own pace back" if pace == 1.0 else f"slows down to {pace:.0%} of its pace"
+            self._sequence.tell(f"the reference {how}: {why}")
+
+    def come_to_rest(self, now_s: float, why: str) -> bool:
+        """The course is to end at rest; False where nothing is flown that could come to rest.
+
+        Args:
+            now_s: vehicle time [s].
+            why: for people.
+        """
+        if self._pacing is None or self._sequence.phase not in {*_ON_COURSE, Phase.HOLD}:
+            return False
+        if self._sequence.phase is not Phase.HOLD:
+            self.ended_by = Order.STOP
+            self._pacing.want(0.0, self._t_s)
+            self._sequence.enter(Phase.HOLD, now_s, why)
+        return True
 
     def _end_before(self, order: Order, now_s: float) -> None:
         """Before the course, or after it: nothing of ours is flying."""

@@ -1,4 +1,4 @@
-"""An operator's wish for another pace, planned beside the control steps and then flown."""
+"""A wish for another pace, an operator's or a guard's, planned beside the control steps and then flown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LOOK_AHEAD_S = 0.2
 
 
 class Pacing:
-    """Brings a course to the pace that is wanted: 1, its own, or 0, rest.
+    """Brings a course to the pace that is wanted: from 1, its own, to 0, rest.
 
     Args:
         course: what is flown.
@@ -30,7 +30,7 @@ class Pacing:
         """Wants a pace from now on; wanting what is wanted already changes nothing.
 
         Args:
-            rate: 0 or 1.
+            rate: 0 to 1.
             t_s: time since engaging [s].
         """
         if rate != self._wanted:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from companion.control.types import Quat, Vec3
 from companion.errors import ExitCode
 from companion.flight.health import EstimatorHealth, SystemHealth
+from companion.flight.resets import Reset
 from companion.flight.retuning import Transition
 from companion.flight.tempo import Ramp
 from companion.frames import GeoPoint
@@ -155,6 +156,10 @@ class Engagement:
     """How the course's pace was changed on the way."""
     transitions: tuple[Transition, ...] = ()
     """How the law's parameters were changed on the way."""
+    resets: tuple[Reset, ...] = ()
+    """Jumps of the autopilot's estimate that the flight went on through."""
+    delays: tuple[tuple[float, float], ...] = ()
+    """What the prediction's delay became [s], each with the stamp of the first state that it was used for [s]."""
 
     @classmethod
     def from_numbers(cls, entry: Mapping[str, Any]) -> Engagement:
@@ -169,6 +174,8 @@ class Engagement:
             None if thrust is None else float(thrust),
             tuple(Ramp(*(float(x) for x in ramp)) for ramp in entry.get("ramps", ())),
             tuple(Transition.from_numbers(way) for way in entry.get("transitions", ())),
+            tuple(Reset.from_numbers(reset) for reset in entry.get("resets", ())),
+            tuple((float(at_s), float(delay_s)) for at_s, delay_s in entry.get("delays", ())),
         )
 
 
@@ -197,6 +204,8 @@ class Outcome:
     """The autopilot's parameters that were read."""
     engagement: Engagement | None = None
     """None: the controller never took over."""
+    delay_s: dict[str, float | None] = field(default_factory=dict)
+    """The delay from a state's stamp to the effect of its command: `flight.watch.Watch.delay_figures`."""
 
     def told(self) -> dict[str, Any]:
         """What a flight's log keeps of it: JSON types only."""
@@ -204,6 +213,7 @@ class Outcome:
             **{"cause": self.cause.name, "sentence": self.sentence, "lost_setpoints": self.lost_setpoints},
             **{"rejected_states": self.rejected_states, "parameters": self.parameters},
             "phases": [list(change) for change in self.phases],
+            "delay_s": self.delay_s,
         }
 
     @property

@@ -14,16 +14,30 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from companion.control.model import lagged
-from companion.control.types import Vec3
+from companion.control.model import lag_factors, lagged
+from companion.control.types import Quat, State, Vec3
+from companion.control.vectors import quat_exp, quat_multiply, quat_normalise
 
 PIECE_MAX_S = 0.010
 """Commands are averaged over pieces of at most this length: the rates lag by more, and every piece costs time."""
+APART_COSINE = math.cos(0.05)
+"""Of half the angle: attitudes further apart than 0.1 rad are of different estimates, with a reset between them."""
 SHORTEST_S = 1e-6
 """Shorter pieces are rounding errors of the stamps."""
 
 Piece = tuple[float, Vec3, float]
 """Mean thrust setpoint [N], mean rate setpoints [rad/s], duration [s]."""
+
+
+class Attitude(NamedTuple):
+    """Attitude and rates at an instant, without the rest of a state."""
+
+    at_s: float
+    """Vehicle time [s]."""
+    q: Quat
+    """Body to inertial."""
+    w: Vec3
+    """Body rates [rad/s]."""
 
 
 class Acting(NamedTuple):
@@ -47,13 +61,18 @@ class Prediction:
         self.thrust = thrust_n
         """The thrust that acts at the last stamp [N], by the model."""
         self._thrust_lag_s = thrust_lag_s
-        self._delay_s = delay_s
         self._at_s: float | None = None
         # until the first command acts, what holds the hover does
         self._acting: deque[Acting] = deque([Acting(-math.inf, thrust_n, (0.0, 0.0, 0.0))])
+        self.length_s = 0.0
+        """Length of the pieces [s]; 0 without a delay."""
+        self.retime(delay_s)
+
+    def retime(self, delay_s: float) -> None:
+        """Another delay from now on; it must not change by as much as a sample interval at once."""
+        self._delay_s = delay_s
         self._count = math.ceil(delay_s / PIECE_MAX_S - 1e-9)
         self.length_s = delay_s / self._count if self._count else 0.0
-        """Length of the pieces [s]; 0 without a delay."""
 
     def sent(self, stamp_s: float, thrust_n: float, rates: Sequence[float]) -> None:
         """Remembers a command (thrust [N], body rates [rad/s]) computed from the state stamped `stamp_s`."""
@@ -87,6 +106,16 @@ class Prediction:
                 at = until
         return out
 
+    def between(self, begin_s: float, end_s: float) -> list[Piece]:
+        """What acts from the stamp that `pieces` was asked for last to a later time [s]."""
+        acting, out = self._acting, []
+        for index, (from_s, thrust, rates) in enumerate(acting):
+            until = acting[index + 1].from_s if index + 1 < len(acting) else math.inf
+            duration_s = min(until, end_s) - max(from_s, begin_s)
+            if duration_s > SHORTEST_S:
+                out.append((thrust, rates, duration_s))
+        return out
+
     def _follow_thrust(self, stamp_s: float) -> None:
         """Brings the modelled thrust to the stamp and forgets commands that have ceased to act."""
         acting = self._acting
@@ -102,3 +131,44 @@ class Prediction:
             if len(acting) < 2 or acting[1].from_s > stamp_s + SHORTEST_S:
                 return
             acting.popleft()
+
+
+def refreshed(state: State, stamp_s: float, attitude: Attitude, pieces: Sequence[Piece], lags_s: Vec3) -> State:
+    """The state at its stamp from which the model comes by a newer attitude; the state itself where that is none.
+
+    Position and velocity stay: attitude and rates are followed back from the newer ones to the stamp.
+
+    Args:
+        state: as received.
+        stamp_s: its stamp [s].
+        attitude: after the stamp.
+        pieces: what acts from the stamp on.
+        lags_s: of roll, pitch and yaw rate behind their setpoints [s].
+    """
+    left_s, spans = attitude.at_s - stamp_s, []
+    for _, rates, length_s in pieces:
+        span_s = min(left_s, length_s)
+        if span_s > SHORTEST_S:
+            spans.append((rates, span_s))
+            left_s -= span_s
+    if left_s > SHORTEST_S:  # beyond what is predicted
+        return state
+    q, w = attitude.q, attitude.w
+    for rates, span_s in reversed(spans):
+        before, turned = zip(*map(_back, w, rates, lags_s, (span_s,) * 3), strict=True)
+        w = (before[0], before[1], before[2])
+        a, b, c, d = quat_exp((turned[0], turned[1], turned[2]))
+        q = quat_multiply(q, (a, -b, -c, -d))
+    apart = abs(sum(a * b for a, b in zip(q, state.q, strict=True)))
+    if apart < APART_COSINE:
+        return state
+    return State(state.p, state.v, quat_normalise(q), w)
+
+
+def _back(w: float, rate: float, lag_s: float, span_s: float) -> tuple[float, float]:
+    """A rate before a span at the end of which it is `w`, and the angle turned meanwhile."""
+    decay, share = lag_factors(lag_s, span_s)
+    if decay <= 0.0:
+        return w, rate * span_s
+    gap = (w - rate) / decay
+    return rate + gap, span_s * (rate + gap * share)

@@ -1,12 +1,15 @@
 """What a flight does when the autopilot's estimate is reset (ODOMETRY.reset_counter): nothing moves but the numbers.
 
 A reset changes what is believed, not where the vehicle is. The jump is the new state less the one that the law's own
-model foresaw for the same stamp. The reference is moved by the position's jump, so that the vehicle stays where it is. A
-velocity that jumps is left to the law: the estimate was wrong before, the error is real, and a reference that went along
-would drift away for good. After a jump of the heading the thrust that is believed to act points elsewhere; the
-disturbance estimate changes by as much, so that the believed acceleration stays (at rest this turns the estimate about
-the vertical), and a heading that the vehicle holds as its own turns along. A heading that the trajectory asks for stays
-as it is in the world, and the nose turns there no faster than `limits.heading_rate_max_rad_s`.
+model foresaw for the same stamp. The reference is moved by the position's jump, so that the vehicle stays where it is.
+
+A velocity that jumps is left to the law: the estimate was wrong before, the error is real, and a reference that went
+along would drift away for good.
+
+After a jump of the heading the thrust that is believed to act points elsewhere. The disturbance estimate changes by as
+much, so that the believed acceleration stays (at rest this turns the estimate about the vertical), and a heading that
+the vehicle holds as its own turns along. One that the trajectory asks for stays as it is in the world, and the nose
+turns there no faster than `limits.heading_rate_max_rad_s`.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from companion.config import Vehicle, merged, validate
 from companion.control import flat
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.law import ControllerState, Gains, Limits, Model, Parameters
+from companion.control.model import Factors
 from companion.control.types import Reference, State
 from companion.errors import InputError
 from companion.flight.prediction import Piece
@@ -207,6 +208,11 @@ class Turning:
             self._first = False
         self.new.retune(parameters._replace(limits=limits))
         self._old.retune(parameters._replace(gains=parameters.gains._replace(heading_kind=self._kind)))
+
+    def relag(self, lags: Factors) -> None:
+        """Steps of both with pieces of another length from now on."""
+        self._old.relag(lags)
+        self.new.relag(lags)
 
     def step(
         self,

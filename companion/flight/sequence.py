@@ -42,6 +42,12 @@ CONFIRM_TIMEOUT_S = 2.5
 START_SPEED_MAX_M_S = 1.0
 """Faster, the vehicle does not hold, and there is no hold point to begin from."""
 START_TIMEOUT_S = 30.0
+HANDOVER_MODES = (modes.HOLD, modes.LAND)
+"""What the autopilot is asked for at the end, the next one where it refuses the one before."""
+REFUSALS_MAX = 3
+"""One refusal may be of the moment: PX4 judges a mode ten times per second."""
+INTENTION_WAIT_S = 0.3
+"""What a change of mode was meant to be comes with CURRENT_MODE, at 10 Hz."""
 FRESH_S = 0.5
 """An older state does not say where the vehicle is."""
 REASON_WAIT_S = 0.5
@@ -109,6 +115,14 @@ class Sequence:
         self._mode_at_end: Mode | None = None
         self._mode_at_landing: Mode | None = None
         self._confirmed_hold_s: float | None = None
+        self._rungs: tuple[Mode, ...] = HANDOVER_MODES
+        self._refusals = 0
+        self._rest_for: tuple[Cause, str] | None = None
+        """Why a guard lets the course come to rest."""
+        self._other_mode_s: float | None = None
+        self._other_mode: Mode = modes.HOLD
+        """A mode that this flight did not ask for, and since when."""
+        self._meant: set[Mode] = set()
         self.orders = Orders(self, autopilot, flight.vehicle.link.state_rate_hz)
         """What the operator wants."""
 
@@ -150,6 +164,8 @@ class Sequence:
         self._ops.update(now_s)
         if self.ending is None:
             self._watch_mode(now_s)
+            if self._other_mode_s is not None:
+                return
             self.orders.tick(now_s)
         if self.ending is not None:
             self._hand_over(now_s)
@@ -167,11 +183,33 @@ class Sequence:
         elif self.phase is Phase.LAND:
             self._land(now_s)
 
-    def end(self, cause: Cause, detail: str, now_s: float) -> None:
-        """Begins to hand over to the autopilot's Hold; the first cause stays."""
+    def tell(self, line: str) -> None:
+        """A line for people."""
+        self._notify(line)
+
+    def come_to_rest(self, cause: Cause, detail: str, now_s: float) -> None:
+        """Lets the course come to rest on its path and then hands over; where there is no course, at once."""
+        if self.ending is not None or self._rest_for is not None:
+            return
+        sentence = f"{cause.value.sentence}: {detail}"
+        if self.orders.come_to_rest(now_s, sentence):
+            self._rest_for = cause, detail
+        else:
+            self.end(cause, detail, now_s)
+
+    def end(self, cause: Cause, detail: str, now_s: float, rungs: tuple[Mode, ...] = HANDOVER_MODES) -> None:
+        """Begins to hand over to the autopilot; the first cause stays.
+
+        Args:
+            cause: why.
+            detail: figures, for people.
+            now_s: vehicle time [s].
+            rungs: the modes to ask for, the next one where the autopilot refuses the one before.
+        """
         if self.ending is not None:
             return
         self.ending = (cause, detail)
+        self._rungs, self._refusals = rungs, 0
         self._operation = None
         self._step_s = now_s - HANDOVER_INTERVAL_S
         self._since_s = now_s
@@ -338,6 +376,8 @@ class Sequence:
         wish = self.orders.ended_by
         if wish is Order.LAND:
             self.land_from_here(now_s)
+        elif self._rest_for is not None:
+            self.end(*self._rest_for, now_s)
         elif wish is Order.STOP:
             self.end(Cause.STOPPED, "", now_s)
         elif self._flight.after == "land":
@@ -373,17 +413,26 @@ class Sequence:
         Raises:
             FlightEnded: nothing more is asked for or sent.
         """
-        mode = self._autopilot.mode
+        mode, intended = self._autopilot.mode, self._autopilot.intended
         if mode is None:
             return
-        self._mode_seen = self._mode_seen or mode == _AWAITED.get(self.phase)
-        allowed = self._allowed_modes()
-        if allowed is None or mode in allowed:
+        if self._other_mode_s is None:
+            if self.duty is Duty.TRACK and not self._autopilot.armed:
+                self.duty = Duty.NOTHING
+                raise FlightEnded(Cause.DISARMED, "nothing more is sent")
+            self._mode_seen = self._mode_seen or mode == _AWAITED.get(self.phase)
+            allowed = self._allowed_modes()
+            if allowed is None or mode in allowed:
+                return
+            self._meant = allowed
+            self.duty = Duty.NOTHING
+            self._other_mode_s, self._other_mode = now_s, mode
+            self._notify(f"the autopilot reports {mode.label}: nothing more is sent")
+        if intended in self._meant and now_s - self._other_mode_s < INTENTION_WAIT_S:
             return
-        self.duty = Duty.NOTHING
+        cause = Cause.FAILSAFE if intended in self._meant else Cause.TAKEN_OVER
         said = "; ".join(self._ops.texts.complaints(now_s - 1.0, now_s))
-        self._notify("another hand took the vehicle over: nothing more is sent")
-        raise FlightEnded(Cause.TAKEN_OVER, f"the autopilot reports {mode.label}" + (f" ({said})" if said else ""))
+        raise FlightEnded(cause, f"the autopilot reports {self._other_mode.label}" + (f" ({said})" if said else ""))
 
     def _allowed_modes(self) -> set[Mode] | None:
         """The modes that this flight's own requests lead to now; None for any."""
@@ -400,28 +449,35 @@ class Sequence:
         return {modes.OFFBOARD} if self.duty is Duty.TRACK else None
 
     def _hand_over(self, now_s: float) -> None:
-        """Asks for Hold every 100 ms until it is acknowledged, then waits until it is reported, then ends."""
+        """Asks for Hold every 100 ms until it is acknowledged, then waits until it is reported, then ends; where the
+        autopilot refuses it, the same with the next rung."""
         assert self.ending is not None
         cause, detail = self.ending
-        operation, mode = self._operation, self._autopilot.mode
+        operation, mode, wanted = self._operation, self._autopilot.mode, self._rungs[0]
         if self._confirmed_hold_s is not None:
-            if mode == modes.HOLD or now_s - self._confirmed_hold_s > CONFIRM_TIMEOUT_S:
-                where = "the vehicle is in Hold" if mode == modes.HOLD else "Hold was acknowledged"
+            if mode == wanted or now_s - self._confirmed_hold_s > CONFIRM_TIMEOUT_S:
+                label = wanted.label
+                where = f"the vehicle is in {label}" if mode == wanted else f"{label} was acknowledged"
                 raise FlightEnded(cause, f"{detail}; {where}".lstrip("; "))
         elif mode is not None and mode not in self._modes_to_leave():
             self._give_up(f"the autopilot reports {mode.label} by another hand, nothing more is asked of it")
-        elif operation is not None and (operation.accepted or self._autopilot.intended == mode == modes.HOLD):
+        elif operation is not None and (operation.accepted or self._autopilot.intended == mode == wanted):
             self._confirmed_hold_s = now_s
             self.duty = Duty.NOTHING
         elif now_s - self._since_s > HANDOVER_TIMEOUT_S:
-            self._give_up("Hold was not acknowledged, the autopilot's own failsafe acts")
+            self._give_up(f"{wanted.label} was not acknowledged, the autopilot's own failsafe acts")
         elif now_s - self._step_s >= HANDOVER_INTERVAL_S - 1e-9:
             self._step_s = now_s
-            self._operation = self._ops.set_mode(modes.HOLD, now_s, Retry(HANDOVER_INTERVAL_S, 1))
+            if operation is not None and operation.refused:
+                self._refusals += 1
+                if self._refusals >= REFUSALS_MAX and len(self._rungs) > 1:
+                    self._refusals, self._rungs, self._since_s = 0, self._rungs[1:], now_s
+                    self._notify(f"{operation.sentence}; asking for {self._rungs[0].label}")
+            self._operation = self._ops.set_mode(self._rungs[0], now_s, Retry(HANDOVER_INTERVAL_S, 1))
 
     def _modes_to_leave(self) -> set[Mode | None]:
         """The modes that Hold may be asked for in; any other was chosen by somebody else, and stays."""
-        return {modes.HOLD, modes.OFFBOARD, self._mode_at_end, _AWAITED.get(self.phase)}
+        return {modes.HOLD, modes.OFFBOARD, self._mode_at_end, self._rungs[0], _AWAITED.get(self.phase)}
 
     def _give_up(self, why: str) -> None:
         assert self.ending is not None

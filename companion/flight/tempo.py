@@ -83,6 +83,11 @@ class Tempo:
         """Time since engaging at which the last change is over [s]; 0 when there was none."""
         return self._spans[-1].ramp.begin_s + self._spans[-1].ramp.duration_s if self._spans else 0.0
 
+    @property
+    def rate(self) -> float:
+        """The pace when the last change is over."""
+        return self._spans[-1].ramp.rate if self._spans else 1.0
+
     def add(self, ramp: Ramp) -> None:
         """Changes the pace; the ramp must not begin before those that are there have begun, nor in the past."""
         self._spans.append(_span(self.at(ramp.begin_s), ramp))
@@ -116,7 +121,7 @@ class RampPlan:
         tempo: the pace so far.
         path: the course at its own pace.
         begin_s: when the change is to begin, time since engaging [s].
-        rate: the pace afterwards, 0 or 1.
+        rate: the pace afterwards, 0 to 1.
         limits: of the vehicle.
         model: of the vehicle.
     """

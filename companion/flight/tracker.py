@@ -20,8 +20,9 @@ from companion.control.law import ControllerState, Parameters, start, step
 from companion.control.model import Factors, advance, factors
 from companion.control.output import Conversion, Setpoint, actuator_output, attitude_output, lead, rates_output
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
-from companion.control.vectors import axes
-from companion.flight.prediction import Piece, Prediction
+from companion.control.vectors import add, axes, norm, scale
+from companion.flight.prediction import Attitude, Piece, Prediction, refreshed
+from companion.flight.resets import Reset, about_vertical
 from companion.flight.retuning import Transition, Turning, between
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
@@ -44,6 +45,10 @@ class Engine(Protocol):
 
     def retune(self, parameters: Parameters) -> None:
         """Steps with these parameters from now on; the model stays."""
+        ...
+
+    def relag(self, lags: Factors) -> None:
+        """Steps with pieces of another length from now on: their `model.factors`."""
         ...
 
     def step(
@@ -107,6 +112,10 @@ class PlainEngine:
         """Steps with these parameters from now on; the model stays."""
         self._parameters = parameters
 
+    def relag(self, lags: Factors) -> None:
+        """Steps with pieces of another length from now on."""
+        self._lags = lags
+
     def step(
         self,
         state: State,
@@ -161,6 +170,11 @@ class CompiledEngine:
     def retune(self, parameters: Parameters) -> None:
         """Steps with these parameters from now on; the model stays."""
         self._c[:] = flat.constants(parameters, self._lags)
+
+    def relag(self, lags: Factors) -> None:
+        """Steps with pieces of another length from now on."""
+        self._lags = lags
+        self._c[-len(lags) :] = lags
 
     def step(
         self,
@@ -247,6 +261,7 @@ class Tracker:
         self.parameters = vehicle.parameters()
         self._output = output
         x, y, z = vehicle.autopilot.rate_lag_s
+        self._lags_s = (x, y, z, vehicle.rotors.lag_s)
         self._conversion = conversion(vehicle)
         self._interval_s = 1.0 / vehicle.link.state_rate_hz
         self._gap_max_s = vehicle.limits.state_gap_max_s
@@ -254,13 +269,22 @@ class Tracker:
         self._slow_tau: Vec3 = ZERO
         self.delay_s = vehicle.delay_s if vehicle.controller.prediction else 0.0
         self._prediction = self._new_prediction(0.0)
-        length = self._prediction.length_s or self._interval_s
-        lags = factors((x, y, z, vehicle.rotors.lag_s), length)
-        self._build: Callable[[Parameters], Engine] = lambda parameters: compiled.build(parameters, lags)
+        self._lags = self._factors()
+        self._build: Callable[[Parameters], Engine] = lambda parameters: compiled.build(parameters, self._lags)
         self._engine = self._build(self.parameters)
         self._transition: Transition | None = None
         self.transitions: list[Transition] = []
         """The ways to other parameters so far, the one under way among them."""
+        self.delays: list[tuple[float, float]] = []
+        """The delays that were predicted over after the vehicle file's, each with the stamp of its first state [s]."""
+        self._delay_wanted_s: float | None = None
+        self._seen: State | None = None
+        self._attitude: Attitude | None = None
+        self.refreshed = 0
+        """States whose rotation was predicted from a newer attitude."""
+
+    def _factors(self) -> Factors:
+        return factors(self._lags_s, self._prediction.length_s or self._interval_s)
 
     def _new_prediction(self, thrust_n: float) -> Prediction:
         return Prediction(self.vehicle.rotors.lag_s, self.delay_s, thrust_n)
@@ -285,6 +309,7 @@ class Tracker:
         self._prediction = self._new_prediction(thrust)
         self._slow_tau = ZERO
         self._last_s = None
+        self._attitude = None
 
     def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
         """The command for one state.
@@ -301,15 +326,68 @@ class Tracker:
             dt = stamp_s - self._last_s
             if not 0.0 < dt <= self._gap_max_s:  # too long to integrate over: the controller's state waits
                 dt, integrate = self._interval_s, False
-        self._last_s = stamp_s
+        self._last_s, self._seen = stamp_s, state
         prediction = self._prediction
+        if self._delay_wanted_s is not None:
+            self._retime(self._delay_wanted_s, stamp_s)
         if self._transition is not None:
             self._follow(self._transition, stamp_s, state)
         pieces = prediction.pieces(stamp_s)
+        if self._attitude is not None and self._attitude.at_s > stamp_s:
+            state = self._refreshed(state, stamp_s, self._attitude, pieces)
         reference = reference_at(stamp_s + self.delay_s)
         numbers = self._engine.step(state, reference, prediction.thrust, pieces, frozen or not integrate, integrate, dt)
         prediction.sent(stamp_s, numbers[flat.THRUST], numbers[flat.RATES_MODEL])
         return TrackerStep(self._convert(numbers, dt), numbers)
+
+    # -- what the states alone do not tell ------------------------------------------------------------------------
+
+    def refresh(self, attitude: Attitude) -> None:
+        """An attitude that may be newer than the next state: the prediction's rotation then starts from it."""
+        self._attitude = attitude
+
+    def _refreshed(self, state: State, stamp_s: float, attitude: Attitude, pieces: list[Piece]) -> State:
+        x, y, z, _ = self._lags_s
+        found = refreshed(state, stamp_s, attitude, pieces, (x, y, z))
+        self.refreshed += found is not state
+        return found
+
+    def retime(self, delay_s: float) -> None:
+        """Predicts over another delay from the next state on [s]; nothing changes where nothing is predicted."""
+        if self.vehicle.controller.prediction and delay_s > 0.0:
+            self._delay_wanted_s = delay_s
+
+    def _retime(self, delay_s: float, stamp_s: float) -> None:
+        self._delay_wanted_s = None
+        self.delay_s = delay_s
+        self.delays.append((stamp_s, delay_s))
+        self._prediction.retime(delay_s)
+        self._lags = self._factors()
+        self._engine.relag(self._lags)
+
+    def foresee(self, stamp_s: float) -> tuple[State, float] | None:
+        """The state at a stamp, from the last one and the commands since, and the thrust over the mass [m/s^2]; None
+        before the first state."""
+        state, thrust, model = self._seen, self._prediction.thrust, self.parameters.model
+        if state is None or self._last_s is None:
+            return None
+        vehicle, b_hat = (model.mass, model.gravity, model.drag), self._engine.controller.b_hat
+        for setpoint, rates, duration_s in self._prediction.between(self._last_s, stamp_s):
+            lags = factors(self._lags_s, duration_s)
+            state, thrust = advance(state, thrust, rates, setpoint, b_hat, vehicle, lags, duration_s)
+        return state, thrust / model.mass
+
+    def carry(self, reset: Reset) -> None:
+        """Goes on after a reset of the autopilot's estimate as if nothing had happened: what is remembered in the
+        inertial frame turns along."""
+        controller, yaw = self._engine.controller, reset.turned_rad
+        heading, b_hat = controller.heading, add(controller.b_hat, reset.disturbance_m_s2)
+        size, bound = norm(b_hat), self.parameters.limits.disturbance_max
+        if size > bound:
+            b_hat = scale(bound / size, b_hat)
+        heading = HeadingState(about_vertical(yaw, heading.r2d), about_vertical(yaw, heading.forward), heading.held)
+        self._engine.begin(controller._replace(b_hat=b_hat, heading=heading))
+        self._attitude = None
 
     # -- other parameters in flight -------------------------------------------------------------------------------
 

@@ -75,6 +75,11 @@ class Operation:
         return self.result is Result.ACCEPTED
 
     @property
+    def refused(self) -> bool:
+        """Whether the autopilot answered that it will not."""
+        return self.result in _REFUSALS
+
+    @property
     def sentence(self) -> str:
         """How it stands, in words; a refusal with what the autopilot said around it (its reason may come after its
         answer)."""

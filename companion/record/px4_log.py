@@ -29,6 +29,10 @@ _WANTED: Final = {
 _MOTORS: Final = ("actuator_motors", "actuator_outputs")
 _MARGIN_S: Final = 5.0
 """Of PX4's log so much is shown before and after the flight's record."""
+_MISSING: Final = 1.8
+"""Between samples further apart than so many median intervals nothing is compared."""
+_GAP_MEDIANS: Final = 5.0
+_GAP_S: Final = 0.25
 _DELAY_MOST_S: Final = 0.25
 _DELAY_STEP_S: Final = 0.0005
 _DELAY_AGREEMENT: Final = 0.9
@@ -154,6 +158,21 @@ def clipped(series: Series, from_s: float, to_s: float) -> Series:
 
 
 def at(series: Series, t_s: Sequence[float] | Array) -> Array:
-    """The values between the samples, shape (len(t_s), columns); NaN outside."""
+    """The values between the samples, shape (len(t_s), columns); NaN outside, and where samples are missing."""
+    after = np.searchsorted(series.t_s, t_s).clip(1, max(len(series.t_s) - 1, 1))
+    if len(series.t_s) < 2:
+        return np.full((len(t_s), series.values.shape[1]), np.nan)
+    gaps_s = np.diff(series.t_s)
     columns = [np.interp(t_s, series.t_s, column, left=np.nan, right=np.nan) for column in series.values.T]
-    return np.column_stack(columns)
+    missing = gaps_s[after - 1] > _MISSING * float(np.median(gaps_s))
+    return np.where(missing[:, None], np.nan, np.column_stack(columns))
+
+
+def broken(series: Series) -> Series:
+    """The same with NaN where PX4 logged nothing for a while: a line must not cross that."""
+    if len(series.t_s) < 2:
+        return series
+    gaps_s = np.diff(series.t_s)
+    ends = np.flatnonzero(gaps_s > max(_GAP_MEDIANS * float(np.median(gaps_s)), _GAP_S)) + 1
+    middle_s = 0.5 * (series.t_s[ends - 1] + series.t_s[ends])
+    return Series(np.insert(series.t_s, ends, middle_s), np.insert(series.values, ends, np.nan, axis=0))

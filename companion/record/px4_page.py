@@ -17,7 +17,7 @@ from companion.record.flight_data import FlightData
 from companion.record.flight_source import read_source
 from companion.record.folder import write_whole
 from companion.record.page import compose
-from companion.record.px4_log import POSITION, Px4Log, Series, at, clipped, read_px4_log
+from companion.record.px4_log import POSITION, Px4Log, Series, at, broken, clipped, read_px4_log
 from companion.record.report import flight_name, listing, notes, read_flight, section, tile
 
 PX4_FILE: Final = "px4.html"
@@ -118,7 +118,7 @@ def _series(flight: FlightData, px4: Px4Log, topic: str, *fields: str) -> Series
 def _shown(flight: FlightData, series: Series) -> Series | None:
     t_s = flight.record.column("t_s")
     part = clipped(series, float(t_s[0]), float(t_s[-1]))
-    return Series(part.t_s - flight.start_s, part.values) if len(part.t_s) else None
+    return broken(Series(part.t_s - flight.start_s, part.values)) if len(part.t_s) else None
 
 
 def _by_axis(
@@ -142,11 +142,11 @@ def _position(flight: FlightData, px4: Px4Log) -> dict[str, Any] | None:
 
 
 def _differences(flight: FlightData, px4: Px4Log) -> dict[str, Any] | None:
-    theirs = _series(flight, px4, POSITION, "x", "y", "z", "vx", "vy", "vz")
+    theirs = px4.series(POSITION, "x", "y", "z", "vx", "vy", "vz")
     if theirs is None:
         return None
     ours = flight.record.columns("p_n", "p_e", "p_d", "v_n", "v_e", "v_d")
-    apart = 100.0 * (ours - at(theirs, flight.time_s))
+    apart = 100.0 * (ours - at(theirs, flight.record.column("t_s")))
     names = ["north", "east", "down"]
     data = lines(flight.time_s, apart[:, :3], names, AXES) + lines(flight.time_s, apart[:, 3:], names, AXES, row=2)
     return {"data": data, "layout": _layout(flight, ["Position [cm]", "Velocity [cm/s]"])}

@@ -133,7 +133,8 @@ def note_end(
 
     Args:
         summary: of `summarise`; changed.
-        outcome: "sentence", "cause" and "rejected_states", as the flight's log keeps them.
+        outcome: "sentence", "cause", "rejected_states" and, where the law flew, "delay_s", as the flight's log keeps
+            them.
         engagement: how the controller took over, if it did.
         px4_parameters: those of PX4's own controller, for a flight of its.
     """
@@ -141,6 +142,8 @@ def note_end(
     if engagement is not None:
         summary["engagement"] = engagement
     summary["rejected_states"] = outcome["rejected_states"]
+    if outcome.get("delay_s"):
+        summary["delay_s"] = outcome["delay_s"]
     if summary["controller"] == "px4":
         summary["px4_parameters"] = px4_parameters
     if outcome["cause"] != COMPLETED:

@@ -22,6 +22,7 @@ from companion.errors import ExitCode
 from companion.flight import last_resort, loop
 from companion.flight.phases import Cause
 from sim_link import codec
+from sim_link.fault_kinds import fault
 from sim_link.modes import Mode
 
 ODOMETRY = codec.ID_ODOMETRY
@@ -137,12 +138,13 @@ def test_lost_acknowledgement_is_made_up_for_by_the_reported_mode(tmp_path) -> N
     assert 1 <= len(stand.mode_requests(0.1)) <= 3
 
 
-def test_estimate_that_jumps_is_not_flown_on(tmp_path) -> None:
-    with Stand(make_flight(), tmp_path, alter=broken(reset_counter=7)) as stand:
+def test_estimate_that_jumps_far_is_not_flown_on(tmp_path) -> None:
+    with Stand(make_flight(), tmp_path, alter=broken(reset_counter=7, p=(3.0, 0.0, -20.0))) as stand:
         flown = stand.fly()
         assert stand.mode is Mode.HOLD
     assert (flown.cause, flown.code) == (Cause.ESTIMATE_JUMPED, ExitCode.LOST)
-    assert "reset counter 7" in flown.outcome.sentence
+    assert "moved by 3.00 m" in flown.outcome.sentence
+    assert "(limits.estimate_jump_max_m), reset counter 7" in flown.outcome.sentence
     (coast,) = stand.setpoints(FAULT_S)
     assert coast.message.body_pitch_rate == 0.0
 
@@ -339,8 +341,9 @@ def test_fault_of_the_program_still_hands_over(damage, cause: Cause, says: str, 
 
 
 def test_offboard_refused(tmp_path) -> None:
-    """MAV_FWDEXTSP 0 makes PX4 deaf to setpoints: OFFBOARD is refused, the vehicle stays in Hold."""
-    with Stand(make_flight(), tmp_path, parameters={"MAV_FWDEXTSP": 0}) as stand:
+    """MAV_FWDEXTSP 0 makes PX4 deaf to setpoints: set after it was read, OFFBOARD is refused, the vehicle holds."""
+    deaf = fault("parameter", 0.8, name="MAV_FWDEXTSP", value=0)
+    with Stand(make_flight(), tmp_path, faults=(deaf,)) as stand:
         flown = stand.fly()
         assert stand.mode is Mode.HOLD
     assert (flown.cause, flown.code) == (Cause.REFUSED, ExitCode.REFUSED)

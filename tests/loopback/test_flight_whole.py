@@ -14,6 +14,7 @@ from companion import accelerate
 from companion.errors import ExitCode
 from companion.flight import connect
 from companion.flight.bundled import free_udp_port
+from companion.flight.health import SystemHealth
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause
 from companion.flight.tracker import kernels
@@ -24,6 +25,7 @@ from companion.record.summary import without_wall_clock
 from companion.trajectory.load import of_flight
 from sim_link import codec
 from sim_link.codec import mavlink
+from sim_link.fault_kinds import fault
 from sim_link.modes import Mode
 
 WALL_COLUMNS = ("state_age_ms", "step_us", "late")
@@ -122,9 +124,12 @@ def test_refused_before_anything_moves(what: str, tmp_path) -> None:
     assert stand.mode_requests(-math.inf) == []
 
 
-def test_arming_denied(tmp_path) -> None:
-    """The autopilot's own words are the reason, and the take-off mode does not stay selected."""
-    with Stand(make_flight(), tmp_path, start=None, parameters={"COM_ARMABLE": 0}) as stand:
+def test_arming_denied(tmp_path, monkeypatch) -> None:
+    """After the checks: the autopilot's own words are the reason, and the take-off mode does not stay selected."""
+    later = fault("parameter", 1.0, name="COM_ARMABLE", value=0)
+    health = SystemHealth(sticks=False, fence_kept=None, can_arm=True, battery=1.0)
+    monkeypatch.setattr(SystemHealth, "from_message", classmethod(lambda cls, message: health))
+    with Stand(make_flight(), tmp_path, start=None, faults=(later,)) as stand:
         flown = stand.fly()
         assert not stand.vehicle.autopilot.armed
         assert stand.mode is Mode.HOLD

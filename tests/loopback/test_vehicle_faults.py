@@ -192,7 +192,7 @@ def test_a_parameter_changes_in_flight_and_listeners_are_told() -> None:
     with flight(fault("parameter", 1.0, 1.5, name="COM_OBL_RC_ACT", value=4)) as c:
         c.until(lambda: c.t_us > 2_800_000)
         told = [(m.param_id, mavlink_int(m.param_value)) for m in c.of_type("PARAM_VALUE")]
-        assert told == [("COM_OBL_RC_ACT", 4), ("COM_OBL_RC_ACT", 0)]
+        assert told == [("COM_OBL_RC_ACT", 4), ("COM_OBL_RC_ACT", 5)]
 
 
 def mavlink_int(value: float) -> int:

@@ -190,7 +190,8 @@ class Flight:
         self.thread = threading.Thread(target=lambda: self.results.append(self.hil.run()))
         self.thread.start()
         self._link = Link(self.instance) if link else None
-        self.px4 = Px4("none_iris", self.instance, folder, PX4_SIM_SPEED_FACTOR=f"{options.speed:g}")
+        environment = {"PX4_SIM_SPEED_FACTOR": f"{options.speed:g}", "PX4_PARAM_COM_OBL_RC_ACT": "5"}
+        self.px4 = Px4("none_iris", self.instance, folder, **environment)
 
     def close(self) -> None:
         self.px4.stop()

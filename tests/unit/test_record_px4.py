@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from companion.cli import app, main
 from companion.errors import InputError
+from companion.record import px4_log as px4_log_module
 from companion.record import ulog
 from companion.record.alignment import Motion, align
 from companion.record.flight_record import FlightRecord
@@ -174,6 +175,17 @@ def test_what_does_not_belong_together_is_refused(
     assert main(["report", "--from-px4", str(path), *flights]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+
+
+def test_what_px4_did_not_log_is_neither_drawn_nor_compared() -> None:
+    t_s = np.concatenate((np.arange(0.0, 1.0, 0.01), np.arange(3.0, 4.0, 0.01)))
+    series = px4_log_module.Series(t_s, t_s[:, None])
+    drawn = px4_log_module.broken(series)
+    assert len(drawn.t_s) == len(t_s) + 1
+    assert np.isnan(drawn.values[100, 0])
+    assert drawn.t_s[100] == pytest.approx(1.995)
+    between = px4_log_module.at(series, [-1.0, 0.505, 2.0, 3.505, 5.0])[:, 0]
+    assert between == pytest.approx([math.nan, 0.505, math.nan, 3.505, math.nan], nan_ok=True)
 
 
 def motion(t_s: np.ndarray, rate: float = 0.7, laps: float = 1e9, size: float = 5.0) -> Motion:
