@@ -41,10 +41,10 @@ demo: $(VENV)/.run  ## Fly the paper's figure of eight on the bundled vehicle
 	$(PY) -m companion demo
 
 test: $(VENV)/.test  ## Run the tests
-	$(PY) -m pytest
+	$(PY) -m pytest -n 2 --dist loadfile
 
 test-plain: $(VENV)/.test  ## Run the tests as they run where numba is not installed
-	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest
+	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest -n 2 --dist loadfile
 
 lint: $(VENV)/.lint  ## Check style, types and import rules
 	$(PY) -m ruff check .

@@ -18,6 +18,9 @@ class VehicleClock:
 
     def __init__(self, peer: PacedPeer) -> None:
         self._peer = peer
+        self.waits = False
+        """Stands still between messages: as long as it is not known whether the vehicle is in lockstep, no wall time may
+        get into what is its time in the end."""
         self._latest_s = 0.0
         self._offset_ns: int | None = None
         self._offset_wall_ns = 0
@@ -50,7 +53,7 @@ class VehicleClock:
 
     def now_s(self, wall_ns: int) -> float:
         """Vehicle time at a monotonic wall time [s]."""
-        if self._offset_ns is not None and not self._peer.paced:
+        if self._offset_ns is not None and not (self._peer.paced or self.waits):
             self._advance((wall_ns + self._offset_ns) * 1e-9)
         return self._latest_s
 

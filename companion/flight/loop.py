@@ -170,6 +170,7 @@ class FlightLoop:
         self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz)
         self._peer = PacedPeer()
         self._clock = VehicleClock(self._peer)
+        self._clock.waits = True
         self._autopilot = Autopilot()
         self._interrupted = False
         self._met = False
@@ -318,6 +319,7 @@ class FlightLoop:
         undecided = self._telemetry.accepted < PACE_STATES and wall_ns - self._known_ns < PACE_WALL_S * 1e9
         if undecided and not self._peer.paced:
             return False
+        self._clock.waits = False
         now_s = self._clock.now_s(wall_ns)
         self._heartbeat_s = self._last_state_s = now_s
         self._last_arrival_ns = wall_ns

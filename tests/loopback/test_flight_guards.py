@@ -58,22 +58,26 @@ def watch_truth(stand: Stand, places: list) -> None:
         stand.after_offboard(0.1 * i, lambda: places.append((stand.offboard_s, truth(stand).p)))
 
 
-@pytest.mark.parametrize(
-    ("wind", "jump", "most_m"),
-    [
-        ((0.0, 0.0, 0.0), {"jump_m": [0.4, -0.3, 0.0]}, 0.02),
-        ((3.0, 0.0, 0.0), {"jump_m": [0.0, 0.0, 0.5], "yaw_deg": 10.0}, 0.06),
-        ((0.0, 0.0, 0.0), {"jump_m_s": [0.2, 0.0, 0.0]}, 0.15),
-    ],
-)
-def test_the_vehicle_stays_where_it_is_when_the_estimate_jumps(wind, jump, most_m: float, tmp_path) -> None:
+WIND = {"world__wind_m_s": [3.0, 0.0, 0.0]}
+JUMPS: list[tuple[dict[str, Any], float]] = [
+    ({"jump_m": [0.4, -0.3, 0.0]}, 0.005),
+    ({"jump_m": [0.0, 0.0, 0.5], "yaw_deg": 10.0}, 0.008),
+    ({"jump_m_s": [0.2, 0.0, 0.0]}, 0.15),  # left to the law: the velocity was wrong before
+]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> list:
+    """Where the vehicle is over time in the same wind, when the estimate does not jump."""
     places: list = []
-    _, flown = fly(
-        tmp_path,
-        ("estimator_reset", jump),
-        prepare=lambda stand: watch_truth(stand, places),
-        world__wind_m_s=list(wind),
-    )
+    fly(tmp_path_factory.mktemp("still"), prepare=lambda stand: watch_truth(stand, places), **WIND)
+    return places
+
+
+@pytest.mark.parametrize(("jump", "most_m"), JUMPS)
+def test_the_vehicle_does_not_move_when_the_estimate_jumps(jump, most_m: float, undisturbed, tmp_path) -> None:
+    places: list = []
+    _, flown = fly(tmp_path, ("estimator_reset", jump), prepare=lambda stand: watch_truth(stand, places), **WIND)
     assert flown.cause is Cause.COMPLETED, flown.outcome.sentence
     engagement = flown.outcome.engagement
     assert engagement is not None
@@ -81,11 +85,11 @@ def test_the_vehicle_stays_where_it_is_when_the_estimate_jumps(wind, jump, most_
     assert reset.moved_m == pytest.approx(jump.get("jump_m", (0.0, 0.0, 0.0)), abs=0.02)
     assert reset.turned_rad == pytest.approx(math.radians(jump.get("yaw_deg", 0.0)), abs=0.01)
     assert any("the reference moves along" in line for line in flown.lines)
-    before = [p for t, p in places if t < AT_S][-1]
-    after = [math.dist(before, p) for t, p in places if t > AT_S]
-    assert len(after) > 15
-    assert max(after) < most_m
-    assert flown.summary["position_max_m"] < 0.5
+    apart = [math.dist(a, b) for (t, a), (_, b) in zip(places, undisturbed, strict=True) if t > AT_S]
+    assert len(apart) > 15
+    assert max(apart) < most_m
+    # The error that the flight is judged by knows nothing of the jump either.
+    assert flown.summary["position_max_m"] < 0.08 + most_m
 
 
 @pytest.mark.parametrize(

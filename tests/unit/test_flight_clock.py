@@ -64,3 +64,12 @@ def test_stands_still_with_a_vehicle_in_lockstep() -> None:
     assert clock.silent_wall_s(103 * S) == pytest.approx(3.0)
     clock.on_state(9_980_000, 103 * S)  # a state is older than the request after it
     assert clock.now_s(103 * S) == 10.0
+
+
+def test_waits_for_the_vehicle_until_it_is_known_whether_that_is_in_lockstep() -> None:
+    clock = VehicleClock(PacedPeer())
+    clock.waits = True
+    clock.on_state(10_000_000, 100 * S)
+    assert clock.now_s(103 * S) == 10.0
+    clock.waits = False
+    assert clock.now_s(103 * S) == pytest.approx(13.0)
