@@ -19,8 +19,8 @@ class VehicleClock:
     def __init__(self, peer: PacedPeer) -> None:
         self._peer = peer
         self.waits = False
-        """Stands still between messages: as long as it is not known whether the vehicle is in lockstep, no wall time may
-        get into what is its time in the end."""
+        """Stands still between messages: until it is known whether the vehicle is in lockstep, no wall time may get in
+        to what is its time in the end."""
         self._latest_s = 0.0
         self._offset_ns: int | None = None
         self._offset_wall_ns = 0

@@ -576,7 +576,8 @@ class FlightLoop:
         self._record.append(row)
         if self._retuning is not None:
             self._retuning.tick()
-        seen = Seen(state, error, step.out, step.skipped, timing.late, self._age_of(state, step), self._peer.paced)
+        age_s, paced = self._age_of(state, step), self._peer.paced
+        seen = Seen(state, error, step.out, step.skipped, timing.late, age_s, step.arrival_ns, paced)
         finding = self._watch.on_step(seen, step.course, self._last_state_s)
         if finding is not None:
             respond(self._sequence, finding, self._last_state_s)

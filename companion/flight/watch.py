@@ -47,6 +47,8 @@ class Seen(NamedTuple):
     """Whether the setpoint went out late, by the wall clock."""
     age_s: float | None
     """Of the state at its arrival; None: not known."""
+    arrival_ns: int
+    """When that was, by our clock."""
     paced: bool
     """In lockstep: nothing is judged by the wall clock."""
 
@@ -155,7 +157,7 @@ class Watch:
         status = _MAV_STATES.get(autopilot.system_status or 0)
         return Slow(
             state_rate_hz=steps / passed_s if known else None,
-            state_age_s=seen.age_s,
+            state_age_s=seen.age_s if seen.paced else self._age_judged_s(seen),
             late_share=(self._late - first.late) / max(steps, 1) if known and not seen.paced else None,
             estimator=() if estimator is None else tuple(estimator.lacking(in_air=True)),
             fence=self._fence(seen.state.p, course),
@@ -163,6 +165,11 @@ class Watch:
             unanswered_s=None if seen.paced or answered_ns is None else (self._asked_ns - answered_ns) * 1e-9,
             failsafe="" if status is None else f"its HEARTBEAT says {status}",
         )
+
+    def _age_judged_s(self, seen: Seen) -> float | None:
+        """How old a state was when it came, by the clocks of the last second [s]."""
+        offset_ns = self.offset.recent_ns
+        return None if offset_ns is None else (seen.arrival_ns + offset_ns - 1000 * seen.state.t_vehicle_us) * 1e-9
 
     def _fence(self, p: Vec3, course: Course) -> str:
         """Which fence is broken: the vehicle file's, the trajectory's own, or the autopilot's."""

@@ -14,6 +14,7 @@ from companion.link.timesync import ClockOffset, clock_offset
 
 WINDOW_NS: Final = 10_000_000_000
 """Of the exchanges within, the one with the shortest round trip counts."""
+RECENT_NS: Final = 1_000_000_000
 DRIFT: Final = 5e-5
 """How far two clocks may drift apart: an old exchange counts as longer by as much of its age."""
 SLEW: Final = 1e-3
@@ -29,6 +30,9 @@ class OffsetFilter:
         """Of the exchange that counts; the offset is wrong by at most half of it."""
         self.answered_ns: int | None = None
         """Our clock when the last answer came."""
+        self.recent_ns: int | None = None
+        """The offset by the last second alone, at once: for judging, not for flying by. A simulated autopilot's clock
+        stalls with its machine, which the offset that is flown by follows too slowly to tell from old states."""
         self._asked: dict[int, None] = {}
         self._exchanges: deque[tuple[int, ClockOffset]] = deque()
         self._used_ns: float | None = None
@@ -52,6 +56,8 @@ class OffsetFilter:
         while received_ns - exchanges[0][0] > WINDOW_NS:
             exchanges.popleft()
         best = min(exchanges, key=lambda known: known[1].round_trip_ns + DRIFT * (received_ns - known[0]))[1]
+        recent = (known[1] for known in exchanges if received_ns - known[0] <= RECENT_NS)
+        self.recent_ns = min(recent, key=lambda known: known.round_trip_ns).offset_ns
         self.offset_ns(received_ns)
         self.answered_ns = received_ns
         self.round_trip_ns, self._target_ns = best.round_trip_ns, best.offset_ns

@@ -76,7 +76,7 @@ def test_what_the_command_line_does_not_know(refusal: Refusal, arguments: list[s
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["simulate", "papr"], "'papr': neither a path nor one of the bundled ones (eight, paper, waypoints, windtest)"),
+        (["simulate", "papr"], "neither a path nor one of the bundled ones (eight, paper, waypoints, windtest)"),
         (["demo", "--flight", "papr"], "no flight file 'papr'"),
         (["certify", "papr"], "file 'papr': neither a path nor one of the bundled ones"),
         (["fly", "papr", "--vehicle", "bundled"], "no trajectory file 'papr'"),

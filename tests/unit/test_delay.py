@@ -49,6 +49,10 @@ def test_the_offset_follows_slowly_and_never_steps() -> None:
     assert max(steps) <= 0.1 * MS + 1
     assert used[0] < OFFSET_NS + MS
     assert used[-1] == OFFSET_NS + 20 * MS
+    # What states are judged by knows at once.
+    exchange(clocks, last_ns + 2_000 * MS, MS, MS, OFFSET_NS - 100 * MS)
+    assert clocks.recent_ns == OFFSET_NS - 100 * MS
+    assert clocks.offset_ns(last_ns + 2_002 * MS) > OFFSET_NS + 17 * MS
 
 
 def test_answers_that_nobody_asked_for_change_nothing() -> None:

@@ -198,7 +198,7 @@ class Flying:
         level = (1.0, 0.0, 0.0, 0.0)
         state = VehicleState(round(1e6 * self.now_s), (0.0, 0.0, -5.0), (0.0,) * 3, level, (0.0,) * 3, 0)
         out = TrackerStep(RateSetpoint(0.5, (0.0, 0.0, 0.0)), (0.0,) * flat.RESULTS)
-        seen = Seen(state, (0.0, 0.0, 0.0), out, 0, late, age_s, paced)
+        seen = Seen(state, (0.0, 0.0, 0.0), out, 0, late, age_s, 0, paced)
         return self.watch.on_step(seen, self.course, self.now_s)
 
     def steps(self, count: int, late_every: int = 0, **how: bool) -> list[Finding]:
