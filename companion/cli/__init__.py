@@ -52,12 +52,12 @@ class LazyGroup(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """All commands, in the order of COMMANDS."""
-        return list(COMMANDS)
+        return [*COMMANDS]  # the command `list` is a module of this package, and hides the builtin
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """The overview, from COMMANDS alone: no command is imported for it."""
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([*COMMANDS.items()])
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of that name, or None."""

@@ -62,6 +62,10 @@ def test_mavproxy(files):
             assert stored.read_bytes() == LINES
             console.do("ftp crc lap.csv", "crc: lap.csv 0x")
             console.do(f"ftp get lap.csv {files}/back.csv", "Wrote")
+            for _ in range(50):  # it says so before the last of it is on the disk
+                if (files / "back.csv").read_bytes() == LINES:
+                    break
+                time.sleep(0.1)
             assert (files / "back.csv").read_bytes() == LINES
             console.do(f"ftp put {files}/bad.csv lap.csv", "Sent file of length", "lap.csv refused")
             assert stored.read_bytes() == LINES

@@ -14,9 +14,9 @@ from companion.control.output import PositionSetpoint
 from companion.control.types import Reference, State
 from companion.errors import RefusedError
 from companion.flight.baseline import Px4Baseline
+from companion.flight.coast import coast_setpoint
 from companion.flight.controller import controller_of
 from companion.flight.launch import prepare
-from companion.flight.responses import coast_setpoint
 from companion.flight.tracker import Tracker, kernels
 from companion.frames import quat_from_yaw
 from companion.link import codec
