@@ -21,7 +21,6 @@ from companion.ground.commands import UserCommand
 from companion.ground.fetch import Reader
 from companion.ground.ftp import INDEX_NAME
 from companion.ground.messages import (
-    COMPANION_COMPONENT,
     DEBUG_VECT,
     NAMED_VALUE_FLOAT,
     AckResult,
@@ -41,7 +40,7 @@ from companion.ground.standing import (
 from companion.link import codec
 from companion.link.framing import Frame
 from companion.link.statustext import Announcement, StatusTexts
-from companion.link.wire import Wire
+from companion.link.wire import COMPANION_COMPONENT, Wire
 
 SYSTEM: Final = 254
 COMPONENT: Final = 190

@@ -17,7 +17,6 @@ from typing import Any, Final, Protocol
 from companion.flight.phases import Order
 from companion.ground.messages import (
     COMMAND_INT,
-    COMPANION_COMPONENT,
     AckResult,
     CommandMessage,
     Severity,
@@ -27,6 +26,7 @@ from companion.ground.messages import (
 from companion.ground.service import GroundLink
 from companion.link import codec
 from companion.link.framing import Frame
+from companion.link.wire import COMPANION_COMPONENT
 
 PROGRESS_INTERVAL_S: Final = 0.4
 """A client that waits for an answer gives up after half a second without a word."""

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.errors import LinkError
-from companion.ground.messages import COMPANION_COMPONENT
 from companion.link.codec import message_formats
 from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame
 from companion.link.transport import Address, Transport, open_transport
+from companion.link.wire import COMPANION_COMPONENT
 
 PEERS_MAX: Final = 16
 """Ground tools at one port; when a further one comes, the one that was silent for longest is forgotten."""

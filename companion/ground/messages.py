@@ -14,13 +14,9 @@ COMMAND_INT: Final = 75
 DEBUG_VECT: Final = 250
 NAMED_VALUE_FLOAT: Final = 251
 
-COMPANION_COMPONENT: Final = 191
 TEXT_BYTES: Final = 50
 
-_COMMAND_LONG = struct.Struct("<7fHBBB")
 _COMMAND_INT = struct.Struct("<4fiifHBBBBB")
-_COMMAND_ACK = struct.Struct("<HBBiBB")
-_STATUSTEXT = struct.Struct("<B50sHB")
 _NAMED_VALUE_FLOAT = struct.Struct("<If10s")
 _DEBUG_VECT = struct.Struct("<Qfff10s")
 _UNKNOWN_PROGRESS = 255
@@ -71,12 +67,11 @@ class Targets(NamedTuple):
 def decode_command(msgid: int, payload: bytes) -> CommandMessage | None:
     """A command's payload; None for other messages."""
     if msgid == codec.COMMAND_LONG:
-        *params, command, system, component, confirmation = _COMMAND_LONG.unpack_from(
-            payload.ljust(_COMMAND_LONG.size, b"\0")
-        )
+        layout = codec.COMMAND_LONG_LAYOUT
+        *params, command, system, component, confirmation = layout.unpack_from(codec.filled(payload, layout.size))
         return CommandMessage(command, tuple(params), system, component, confirmation)
     if msgid == COMMAND_INT:
-        numbers = _COMMAND_INT.unpack_from(payload.ljust(_COMMAND_INT.size, b"\0"))
+        numbers = _COMMAND_INT.unpack_from(codec.filled(payload, _COMMAND_INT.size))
         return CommandMessage(numbers[7], numbers[:7], numbers[8], numbers[9], 0)
     return None
 
@@ -86,7 +81,7 @@ def encode_ack(
 ) -> bytes:
     """COMMAND_ACK; the progress [%] counts while the result is IN_PROGRESS."""
     shown = progress if result is AckResult.IN_PROGRESS else 0
-    return _COMMAND_ACK.pack(command, result, shown, 0, target_system, target_component)
+    return codec.COMMAND_ACK_LAYOUT.pack(command, result, shown, 0, target_system, target_component)
 
 
 def encode_texts(severity: int, text: str, identity: int) -> Iterator[bytes]:
@@ -99,13 +94,13 @@ def encode_texts(severity: int, text: str, identity: int) -> Iterator[bytes]:
     """
     data = text.encode("utf-8", "replace")
     if len(data) <= TEXT_BYTES:
-        yield _STATUSTEXT.pack(severity, data, 0, 0)
+        yield codec.STATUSTEXT_LAYOUT.pack(severity, data, 0, 0)
         return
     chunks = [data[at : at + TEXT_BYTES] for at in range(0, len(data), TEXT_BYTES)]
     if len(chunks[-1]) == TEXT_BYTES:
         chunks.append(b"")  # the last one must have a NUL in it
     for number, chunk in enumerate(chunks[:256]):
-        yield _STATUSTEXT.pack(severity, chunk, identity, number)
+        yield codec.STATUSTEXT_LAYOUT.pack(severity, chunk, identity, number)
 
 
 def encode_named_value(time_boot_ms: int, name: str, value: float) -> bytes:
@@ -120,13 +115,13 @@ def encode_debug_vect(time_usec: int, name: str, vector: tuple[float, float, flo
 
 def decode_named_value(payload: bytes) -> tuple[str, float]:
     """Name and value of NAMED_VALUE_FLOAT."""
-    _, value, name = _NAMED_VALUE_FLOAT.unpack_from(payload.ljust(_NAMED_VALUE_FLOAT.size, b"\0"))
+    _, value, name = _NAMED_VALUE_FLOAT.unpack_from(codec.filled(payload, _NAMED_VALUE_FLOAT.size))
     return _name(name), value
 
 
 def decode_debug_vect(payload: bytes) -> tuple[str, tuple[float, float, float]]:
     """Name and vector of DEBUG_VECT."""
-    _, x, y, z, name = _DEBUG_VECT.unpack_from(payload.ljust(_DEBUG_VECT.size, b"\0"))
+    _, x, y, z, name = _DEBUG_VECT.unpack_from(codec.filled(payload, _DEBUG_VECT.size))
     return _name(name), (x, y, z)
 
 

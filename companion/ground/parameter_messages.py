@@ -7,18 +7,16 @@ import struct
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-PARAM_REQUEST_READ: Final = 20
+from companion.link.codec import PARAM_ERROR_LAYOUT, PARAM_REQUEST_READ_LAYOUT, PARAM_VALUE_LAYOUT, filled
+
 PARAM_REQUEST_LIST: Final = 21
 PARAM_SET: Final = 23
 
 NO_INDEX: Final = 0xFFFF
 """PARAM_VALUE.param_index of what is not in the list."""
 
-_READ = struct.Struct("<hBB16s")
 _LIST = struct.Struct("<BB")
 _SET = struct.Struct("<4sBB16sB")
-_VALUE = struct.Struct("<4sHH16sB")
-_ERROR = struct.Struct("<hBB16sB")
 
 
 class ParameterError(IntEnum):
@@ -64,27 +62,28 @@ def name_of(id_: bytes) -> str:
 
 def decode_read(payload: bytes) -> ReadRequest:
     """PARAM_REQUEST_READ."""
-    index, system, component, id_ = _READ.unpack_from(payload.ljust(_READ.size, b"\0"))
+    layout = PARAM_REQUEST_READ_LAYOUT
+    index, system, component, id_ = layout.unpack_from(filled(payload, layout.size))
     return ReadRequest(system, component, id_, index)
 
 
 def decode_list(payload: bytes) -> tuple[int, int]:
     """Whom PARAM_REQUEST_LIST is for: system and component."""
-    system, component = _LIST.unpack_from(payload.ljust(_LIST.size, b"\0"))
+    system, component = _LIST.unpack_from(filled(payload, _LIST.size))
     return system, component
 
 
 def decode_set(payload: bytes) -> SetRequest:
     """PARAM_SET."""
-    raw, system, component, id_, kind = _SET.unpack_from(payload.ljust(_SET.size, b"\0"))
+    raw, system, component, id_, kind = _SET.unpack_from(filled(payload, _SET.size))
     return SetRequest(system, component, id_, kind, raw)
 
 
 def encode_value(name: str, raw: bytes, kind: int, index: int, count: int) -> bytes:
     """PARAM_VALUE."""
-    return _VALUE.pack(raw, count, index, name.encode("ascii"), kind)
+    return PARAM_VALUE_LAYOUT.pack(raw, count, index, name.encode("ascii"), kind)
 
 
 def encode_error(asker: tuple[int, int], id_: bytes, index: int, error: ParameterError) -> bytes:
     """PARAM_ERROR for a request from (system, component), with the id or index that it had."""
-    return _ERROR.pack(index, *asker, id_, error)
+    return PARAM_ERROR_LAYOUT.pack(index, *asker, id_, error)

@@ -26,7 +26,6 @@ from companion.ground.parameter_file import save_tuning
 from companion.ground.parameter_messages import (
     NO_INDEX,
     PARAM_REQUEST_LIST,
-    PARAM_REQUEST_READ,
     PARAM_SET,
     ParameterError,
     ReadRequest,
@@ -138,7 +137,7 @@ class ParameterServer:
     def handle(self, frame: Frame, link: GroundLink, now_s: float) -> bool:
         """Takes a message of the parameter protocol that is for us or for everybody."""
         asker = (frame.sysid, frame.compid)
-        if frame.msgid == PARAM_REQUEST_READ:
+        if frame.msgid == codec.PARAM_REQUEST_READ:
             read = decode_read(frame.payload)
             if self._ours(read.system, read.component):
                 self._remember(link)

@@ -20,7 +20,7 @@ from companion.ground.channel import Channel, Copy, Note
 from companion.ground.commands import CommandServer
 from companion.ground.hosting import Startable, file_server, open_store, parameter_server, tuned, tuning_of
 from companion.ground.links import GroundPort
-from companion.ground.messages import COMPANION_COMPONENT, Severity, targets_of
+from companion.ground.messages import Severity, targets_of
 from companion.ground.report import Report
 from companion.ground.reports import Reports
 from companion.ground.service import GroundLink, Service
@@ -28,6 +28,7 @@ from companion.ground.settings import Settings
 from companion.ground.standing import Standing
 from companion.link.codec import message_formats
 from companion.link.framing import Frame, FrameParser, LinkCounters
+from companion.link.wire import COMPANION_COMPONENT
 
 WAIT_MS: Final = 10
 TICK_S: Final = 0.01

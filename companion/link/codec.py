@@ -41,18 +41,18 @@ MAV_FRAME_LOCAL_NED: Final = 1
 MAV_MODE_FLAG_SAFETY_ARMED: Final = 128
 
 _HEARTBEAT = struct.Struct("<IBBBBB")
-_COMMAND_LONG = struct.Struct("<7fHBBB")
-_COMMAND_ACK = struct.Struct("<HBBiBB")
+COMMAND_LONG_LAYOUT = struct.Struct("<7fHBBB")
+COMMAND_ACK_LAYOUT = struct.Struct("<HBBiBB")
 _TIMESYNC = struct.Struct("<qqBB")
 _ATTITUDE_QUATERNION = struct.Struct("<I7f16x")
 _ODOMETRY = struct.Struct("<Q13f168x4Bb")  # 168: two covariances of 21 floats
-_SET_ATTITUDE_TARGET = struct.Struct("<I4f3ffBBB")
-_SET_POSITION_TARGET_LOCAL_NED = struct.Struct("<I11fHBBB")
-_SET_ACTUATOR_CONTROL_TARGET = struct.Struct("<Q8fBBB")
-_PARAM_REQUEST_READ = struct.Struct("<hBB16s")
-_PARAM_VALUE = struct.Struct("<4sHH16sB")
-_PARAM_ERROR = struct.Struct("<hBB16sB")
-_STATUSTEXT = struct.Struct("<B50sHB")
+SET_ATTITUDE_TARGET_LAYOUT = struct.Struct("<I4f3ffBBB")
+SET_POSITION_TARGET_LOCAL_NED_LAYOUT = struct.Struct("<I11fHBBB")
+SET_ACTUATOR_CONTROL_TARGET_LAYOUT = struct.Struct("<Q8fBBB")
+PARAM_REQUEST_READ_LAYOUT = struct.Struct("<hBB16s")
+PARAM_VALUE_LAYOUT = struct.Struct("<4sHH16sB")
+PARAM_ERROR_LAYOUT = struct.Struct("<hBB16sB")
+STATUSTEXT_LAYOUT = struct.Struct("<B50sHB")
 _AUTOPILOT_VERSION = struct.Struct("<QQIIIIHH24x18x")
 
 _PARAM_TYPES: Final = {1: "<B", 2: "<b", 3: "<H", 4: "<h", 5: "<I", 6: "<i", 9: "<f"}  # by MAV_PARAM_TYPE
@@ -230,7 +230,7 @@ def decode_cold(frame: RawFrame) -> Any | None:
 # ---- decoders ------------------------------------------------------------------------------------------------------
 
 
-def _filled(payload: bytes, size: int) -> bytes:
+def filled(payload: bytes, size: int) -> bytes:
     """The payload with its truncated zeros back."""
     return payload if len(payload) >= size else payload + bytes(size - len(payload))
 
@@ -242,7 +242,7 @@ def _text(field: bytes) -> str:
 
 def decode_odometry(payload: bytes) -> Odometry:
     """ODOMETRY."""
-    fields = _ODOMETRY.unpack_from(_filled(payload, _ODOMETRY.size))
+    fields = _ODOMETRY.unpack_from(filled(payload, _ODOMETRY.size))
     t, x, y, z, q0, q1, q2, q3, vx, vy, vz, wx, wy, wz, frame, child, resets, estimator, quality = fields
     return Odometry(
         t, frame, child, (x, y, z), (q0, q1, q2, q3), (vx, vy, vz), (wx, wy, wz), resets, estimator, quality
@@ -251,29 +251,29 @@ def decode_odometry(payload: bytes) -> Odometry:
 
 def decode_attitude_quaternion(payload: bytes) -> AttitudeQuaternion:
     """ATTITUDE_QUATERNION; the display offset `repr_offset_q` is for tail-sitters and left out."""
-    t, q0, q1, q2, q3, wx, wy, wz = _ATTITUDE_QUATERNION.unpack_from(_filled(payload, _ATTITUDE_QUATERNION.size))
+    t, q0, q1, q2, q3, wx, wy, wz = _ATTITUDE_QUATERNION.unpack_from(filled(payload, _ATTITUDE_QUATERNION.size))
     return AttitudeQuaternion(t, (q0, q1, q2, q3), (wx, wy, wz))
 
 
 def decode_timesync(payload: bytes) -> Timesync:
     """TIMESYNC."""
-    return Timesync._make(_TIMESYNC.unpack_from(_filled(payload, _TIMESYNC.size)))
+    return Timesync._make(_TIMESYNC.unpack_from(filled(payload, _TIMESYNC.size)))
 
 
 def decode_heartbeat(payload: bytes) -> Heartbeat:
     """HEARTBEAT."""
-    custom_mode, kind, autopilot, base_mode, status, _ = _HEARTBEAT.unpack_from(_filled(payload, _HEARTBEAT.size))
+    custom_mode, kind, autopilot, base_mode, status, _ = _HEARTBEAT.unpack_from(filled(payload, _HEARTBEAT.size))
     return Heartbeat(kind, autopilot, base_mode, custom_mode, status)
 
 
 def decode_command_ack(payload: bytes) -> CommandAck:
     """COMMAND_ACK."""
-    return CommandAck._make(_COMMAND_ACK.unpack_from(_filled(payload, _COMMAND_ACK.size)))
+    return CommandAck._make(COMMAND_ACK_LAYOUT.unpack_from(filled(payload, COMMAND_ACK_LAYOUT.size)))
 
 
 def decode_param_value(payload: bytes) -> ParamValue:
     """PARAM_VALUE. The value is reinterpreted from its four bytes: a cast through the float would lose integers."""
-    raw, _, _, name, kind = _PARAM_VALUE.unpack_from(_filled(payload, _PARAM_VALUE.size))
+    raw, _, _, name, kind = PARAM_VALUE_LAYOUT.unpack_from(filled(payload, PARAM_VALUE_LAYOUT.size))
     layout = _PARAM_TYPES.get(kind)
     value = None if layout is None else struct.unpack_from(layout, raw)[0]
     return ParamValue(_text(name), value, kind)
@@ -281,20 +281,20 @@ def decode_param_value(payload: bytes) -> ParamValue:
 
 def decode_param_error(payload: bytes) -> ParamError:
     """PARAM_ERROR."""
-    _, system, component, name, error = _PARAM_ERROR.unpack_from(_filled(payload, _PARAM_ERROR.size))
+    _, system, component, name, error = PARAM_ERROR_LAYOUT.unpack_from(filled(payload, PARAM_ERROR_LAYOUT.size))
     return ParamError(_text(name), error, system, component)
 
 
 def decode_statustext(payload: bytes) -> StatusText:
     """STATUSTEXT."""
-    severity, text, identity, chunk = _STATUSTEXT.unpack_from(_filled(payload, _STATUSTEXT.size))
+    severity, text, identity, chunk = STATUSTEXT_LAYOUT.unpack_from(filled(payload, STATUSTEXT_LAYOUT.size))
     return StatusText(severity, _text(text), identity == 0 or b"\0" in text, identity, chunk)
 
 
 def decode_autopilot_version(payload: bytes) -> AutopilotVersionMessage:
     """AUTOPILOT_VERSION."""
     capabilities, uid, flight, _, _, _, vendor, product = _AUTOPILOT_VERSION.unpack_from(
-        _filled(payload, _AUTOPILOT_VERSION.size)
+        filled(payload, _AUTOPILOT_VERSION.size)
     )
     return AutopilotVersionMessage(capabilities, uid, flight, vendor, product)
 
@@ -308,7 +308,7 @@ def encode_set_attitude_target(
     time_boot_ms: int, target_system: int, target_component: int, type_mask: int, q: Quat, w: Vec3, thrust: float
 ) -> bytes:
     """SET_ATTITUDE_TARGET (82): attitude, body rates [rad/s], collective thrust 0..1; mask bits say what to ignore."""
-    return _SET_ATTITUDE_TARGET.pack(
+    return SET_ATTITUDE_TARGET_LAYOUT.pack(
         time_boot_ms, q[0], q[1], q[2], q[3], w[0], w[1], w[2], thrust, target_system, target_component, type_mask
     )
 
@@ -332,7 +332,7 @@ def encode_set_position_target_local_ned(
         yaw: heading [rad] and its rate [rad/s].
     """
     p, v, a = vectors
-    return _SET_POSITION_TARGET_LOCAL_NED.pack(
+    return SET_POSITION_TARGET_LOCAL_NED_LAYOUT.pack(
         time_boot_ms, *p, *v, *a, *yaw, type_mask, target_system, target_component, MAV_FRAME_LOCAL_NED
     )
 
@@ -341,7 +341,7 @@ def encode_set_actuator_control_target(
     time_usec: int, group: int, target_system: int, target_component: int, controls: tuple[float, ...]
 ) -> bytes:
     """SET_ACTUATOR_CONTROL_TARGET (139): eight controls of a group, -1..1; group 0 starts roll, pitch, yaw, thrust."""
-    return _SET_ACTUATOR_CONTROL_TARGET.pack(time_usec, *controls, group, target_system, target_component)
+    return SET_ACTUATOR_CONTROL_TARGET_LAYOUT.pack(time_usec, *controls, group, target_system, target_component)
 
 
 def encode_timesync(tc1: int, ts1: int, target_system: int = 0, target_component: int = 0) -> bytes:
@@ -364,9 +364,9 @@ def encode_command_long(
     target_system: int, target_component: int, command: int, confirmation: int, params: tuple[float, ...]
 ) -> bytes:
     """COMMAND_LONG with its seven parameters; NaN is "not given"."""
-    return _COMMAND_LONG.pack(*params, command, target_system, target_component, confirmation)
+    return COMMAND_LONG_LAYOUT.pack(*params, command, target_system, target_component, confirmation)
 
 
 def encode_param_request_read(target_system: int, target_component: int, name: str) -> bytes:
     """PARAM_REQUEST_READ by name (at most 16 ASCII characters); PX4 wants its own system id as the target, not 0."""
-    return _PARAM_REQUEST_READ.pack(-1, target_system, target_component, name.encode("ascii"))
+    return PARAM_REQUEST_READ_LAYOUT.pack(-1, target_system, target_component, name.encode("ascii"))

@@ -50,9 +50,6 @@ ROTARY_WINGS: Final = {2, 3, 4, 13, 14, 15}  # MAV_TYPE: quadrotor, coaxial, hel
 _SECOND_US: Final = 1_000_000
 _FAR_US: Final = 10_000_000
 _LOSS_MAX: Final = 128  # a larger step of the sequence number is a late frame, or a restarted sender
-_SET_ATTITUDE_TARGET = struct.Struct("<I4f3ffBBB")
-_SET_POSITION_TARGET_LOCAL_NED = struct.Struct("<I11fHBBB")
-_SET_ACTUATOR_CONTROL_TARGET = struct.Struct("<Q8fBBB")
 _IGNORE_RATES: Final = 7
 _IGNORE_ATTITUDE: Final = 128
 _NAN3: Final = (math.nan, math.nan, math.nan)
@@ -215,9 +212,7 @@ class Traffic:
         return state_us if state_us is not None and state_us // 1000 & 0xFFFFFFFF == t_ms else t_ms * 1000
 
     def _on_attitude_target(self, payload: bytes) -> None:
-        t_ms, q0, q1, q2, q3, x, y, z, thrust, _, _, mask = _SET_ATTITUDE_TARGET.unpack_from(
-            _filled(payload, _SET_ATTITUDE_TARGET)
-        )
+        t_ms, q0, q1, q2, q3, x, y, z, thrust, _, _, mask = _unpacked(codec.SET_ATTITUDE_TARGET_LAYOUT, payload)
         t_us, down = self._answered_us(t_ms), (0.0, 0.0, -thrust)
         if not mask & _IGNORE_ATTITUDE:
             self._write(topics.ATTITUDE_SETPOINT, t_us, (z, q0, q1, q2, q3, *down))
@@ -226,14 +221,14 @@ class Traffic:
         self._write(topics.THRUST_SETPOINT, t_us, (t_us, *down))
 
     def _on_position_target(self, payload: bytes) -> None:
-        fields = _SET_POSITION_TARGET_LOCAL_NED.unpack_from(_filled(payload, _SET_POSITION_TARGET_LOCAL_NED))
+        fields = _unpacked(codec.SET_POSITION_TARGET_LOCAL_NED_LAYOUT, payload)
         t_ms, mask, p, v, a = fields[0], fields[12], fields[1:4], fields[4:7], fields[7:10]
         vectors = (*(_NAN3 if mask & 7 else p), *(_NAN3 if mask & 56 else v), *(_NAN3 if mask & 448 else a))
         turn = (math.nan if mask & 1024 else fields[10], math.nan if mask & 2048 else fields[11])
         self._write(topics.TRAJECTORY_SETPOINT, self._answered_us(t_ms), (*vectors, *turn))
 
     def _on_actuator_target(self, payload: bytes) -> None:
-        fields = _SET_ACTUATOR_CONTROL_TARGET.unpack_from(_filled(payload, _SET_ACTUATOR_CONTROL_TARGET))
+        fields = _unpacked(codec.SET_ACTUATOR_CONTROL_TARGET_LAYOUT, payload)
         t_us = fields[0]
         self._write(topics.TORQUE_SETPOINT, t_us, (t_us, *fields[1:4]))
         self._write(topics.THRUST_SETPOINT, t_us, (t_us, 0.0, 0.0, -fields[4]))
@@ -322,9 +317,9 @@ class Traffic:
         self._write(topics.BATTERY, self.now_us, numbers)
 
 
-def _filled(payload: bytes, layout: struct.Struct) -> bytes:
-    """The payload with its truncated zeros back."""
-    return payload + bytes(max(layout.size - len(payload), 0))
+def _unpacked(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:
+    """The fields of a payload, its truncated zeros restored."""
+    return layout.unpack_from(codec.filled(payload, layout.size))
 
 
 def _message_id(raw: bytes) -> int:
