@@ -11,7 +11,7 @@ PIP_INSTALL := env -u PIP_TARGET -u PIP_PREFIX -u PIP_ROOT -u PIP_REQUIREMENT -u
 unexport PYTHONHOME PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: demo test test-plain lint format clean help
+.PHONY: demo test test-long test-plain lint format clean help
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1: \2/p' Makefile
@@ -41,10 +41,13 @@ demo: $(VENV)/.run  ## Fly the paper's figure of eight on the bundled vehicle
 	$(PY) -m companion demo
 
 test: $(VENV)/.test  ## Run the tests
-	$(PY) -m pytest -n 2 --dist loadfile
+	$(PY) -m pytest -n 2 --dist loadfile -m "not long"
+
+test-long: $(VENV)/.test  ## Run the tests that take their time: whole campaigns, fault matrices, real time
+	$(PY) -m pytest -n 2 --dist loadfile -m long
 
 test-plain: $(VENV)/.test  ## Run the tests as they run where numba is not installed
-	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest -n 2 --dist loadfile
+	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest -n 2 --dist loadfile -m "not long"
 
 lint: $(VENV)/.lint  ## Check style, types and import rules
 	$(PY) -m ruff check .
