@@ -17,7 +17,7 @@ from companion.link.codec import message_formats
 from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame
 from companion.link.transport import Address, Transport, open_transport
 
-Tap = Callable[[int, bytes, int], None]
+Tap = Callable[[int, bytes, int], object]
 """Called with direction, raw frame and `time.monotonic_ns()` for every frame used or sent, and unknown ones."""
 
 TAP_IN: Final = 0

@@ -45,8 +45,8 @@ class FlightRecord:
         self.phase_names: tuple[str, ...] = tuple(phase_names)
         self.overflow: int = 0
         """Rows that found no place."""
-        self.sink: Callable[[bytes | memoryview], object] | None = None
-        """Called with the bytes of every row, also of one that finds no place; must not block or keep them."""
+        self.sink: Callable[[bytes], object] | None = None
+        """Called with the bytes of every row, also of one that finds no place; must not block."""
         self._length = 0
         self._allocate(capacity)
 
@@ -65,17 +65,16 @@ class FlightRecord:
         A full record only counts (`overflow`). A row of another length or with something else than numbers is a fault
         of the program and raises struct.error.
         """
+        content = _ROW.pack(*row)
         length = self._length
-        if length >= self._capacity:
+        if length < self._capacity:
+            at = length * _ROW.size
+            self._bytes[at : at + _ROW.size] = content
+            self._length = length + 1
+        else:
             self.overflow += 1
-            if self.sink is not None:
-                self.sink(_ROW.pack(*row))
-            return
-        at = length * _ROW.size
-        _ROW.pack_into(self._bytes, at, *row)
-        self._length = length + 1
         if self.sink is not None:
-            self.sink(self._bytes[at : at + _ROW.size])
+            self.sink(content)
 
     def reserve(self, rows: int) -> None:
         """Make room for `rows` more rows than there are now. Allocates and copies: on the ground only."""

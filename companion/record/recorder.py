@@ -19,7 +19,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from io import FileIO
 from pathlib import Path
 from typing import Final
@@ -40,6 +40,7 @@ _FLUSH_S: Final = 0.5
 _ROUND_S: Final = 0.05
 _START_TIMEOUT_S: Final = 20.0
 _NICE: Final = 10
+_ROW: Final = int(Entry.ROW)
 _DIRECTIONS: Final = {int(Direction.IN), int(Direction.OUT)}
 _FAILED_TLOG: Final = 64  # bits of the exit code; the interpreter's own failures are 1 and 2
 _FAILED_ULOG: Final = 128
@@ -52,10 +53,14 @@ class Recorder:
         self._process = process
         self._link = link
         self._writer = writer
-        self._put = writer.put
         self._closed = False
-        self.dropped: int = 0
-        """Datagrams, rows and texts that are not in the logs, because the recorder was too slow or gone."""
+        self._lost = 0
+        self.offer: Callable[[int, bytes, int], object] = writer.put
+        """Hand over one datagram (on a serial line: whole frames). Never blocks, never raises for a lost one.
+
+        Arguments: a `tlog.Direction` or its number; the bytes on the link; time.monotonic_ns() when they came or went.
+        It is the ring's own method: a call between would cost as much as what it does.
+        """
         self.recorded: int | None = None
         """Datagrams that the recorder took; known after `close`, None when it did not say."""
         self.problem: str | None = None
@@ -116,43 +121,33 @@ class Recorder:
         return self._process.pid
 
     @property
+    def dropped(self) -> int:
+        """Datagrams, rows and texts that are not in the logs, because the recorder was too slow or gone."""
+        return self._writer.refused + self._lost
+
+    @property
     def behind(self) -> int:
         """Entries that the child has not taken yet."""
-        return self._writer.put_count - self._writer.taken
+        return self._writer.waiting
 
-    def offer(self, direction: int, raw: bytes, wall_ns: int) -> None:
-        """Hand over one datagram (on a serial line: whole frames). Never blocks, never raises for a lost one.
-
-        Args:
-            direction: a `tlog.Direction`, or its number.
-            raw: the bytes on the link.
-            wall_ns: time.monotonic_ns() when they came or went.
-        """
-        if self._closed or not self._put(direction, raw, wall_ns):
-            self.dropped += 1
-
-    def offer_row(self, row: bytes | memoryview) -> None:
+    def offer_row(self, row: bytes) -> None:
         """Hand over the bytes of a row of the flight's record, as `FlightRecord.sink` gives them. Never blocks."""
-        if self._closed or not self._put(Entry.ROW, row, 0):
-            self.dropped += 1
+        self.offer(_ROW, row, 0)
 
     def note(self, text: str, level: int = Level.NOTICE) -> None:
         """Hand over a line for the log: what happened to the flight. Never blocks; the time is that of the traffic."""
-        content = bytes((level,)) + text.encode("utf-8", "replace")
-        if self._closed or not self._put(Entry.TEXT, content, 0):
-            self.dropped += 1
+        self.offer(Entry.TEXT, bytes((level,)) + text.encode("utf-8", "replace"), 0)
 
     def state(self, key: str, fact: str) -> None:
         """Hand over what is known under a key from now on, for the log. Never blocks; the last one of a key counts."""
-        content = f"{key}\0{fact}".encode("utf-8", "replace")
-        if self._closed or not self._put(Entry.FACT, content, 0):
-            self.dropped += 1
+        self.offer(Entry.FACT, f"{key}\0{fact}".encode("utf-8", "replace"), 0)
 
     def close(self, timeout_s: float = 10.0) -> None:
         """End the logs: the child writes what it has and ends. Waits for `timeout_s` at most; again does nothing."""
         if self._closed:
             return
         self._closed = True
+        self._writer.close()
         lost = missing = 0
         both = f"{TLOG_FILE}, {ULOG_FILE}"
         try:
@@ -164,7 +159,7 @@ class Recorder:
             code = self._process.wait(timeout_s)
             if self.recorded is None or code & ~(_FAILED_TLOG | _FAILED_ULOG):
                 self.problem = f"{both}: the recorder ended early (code {code}); the logs are incomplete"
-                lost = self._writer.put_count - self._writer.taken
+                lost = self._writer.waiting
             elif code:
                 failed = [name for bit, name in ((_FAILED_TLOG, TLOG_FILE), (_FAILED_ULOG, ULOG_FILE)) if code & bit]
                 self.problem = f"{', '.join(failed)}: incomplete, the disk did not take everything"
@@ -172,11 +167,11 @@ class Recorder:
             self.problem = f"{both}: the recorder is still writing; wait before reading the logs"
         except OSError as error:
             self.problem = f"{both}: the recorder is gone ({error.strerror}); the logs are incomplete"
-            lost = self._writer.put_count - self._writer.taken
+            lost = self._writer.waiting
             self._process.poll()
         finally:
             self._link.close()
-        self.dropped += lost
+        self._lost = lost
         if self.problem is None and (self.dropped or missing):
             count = max(self.dropped, missing)
             self.problem = f"{both}: {count} entries are missing, the recorder was too slow"

@@ -20,6 +20,10 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 _ENTRY = struct.Struct("=qIB")  # wall_ns, length, kind
+_HEAD: Final = _ENTRY.size
+_USUAL_BYTES: Final = 640
+"""Entries below this (frames, rows of a record) are written in one call."""
+_PACK: Final = tuple(struct.Struct(f"{_ENTRY.format}{length}s").pack_into for length in range(_USUAL_BYTES))
 _SKIP: Final = 0xFFFFFFFF
 """A length that says: the next entry is at the beginning again."""
 _HEAD_BYTES: Final = 64
@@ -74,12 +78,14 @@ class RingWriter(_Ring):
         page = mmap.PAGESIZE
         for at in range(0, self._size, page):
             self._bytes[at] = 0
-        self._written = 0
         self._at = 0
-        self.put_count = 0
-        """Entries put so far."""
+        self._until = self._size
+        """Up to where there is room, as far as that was looked at."""
+        self._before = 0
+        """Bytes before the ring's beginning was passed last; `_at` more are written altogether."""
+        self._closed = False
 
-    def put(self, kind: int, content: bytes | memoryview, wall_ns: int) -> bool:
+    def put(self, kind: int, content: bytes, wall_ns: int) -> bool:
         """Hand over an entry; False when there is no room for it. Never waits.
 
         Args:
@@ -87,24 +93,53 @@ class RingWriter(_Ring):
             content: any bytes, less than the ring's size.
             wall_ns: a time that the entry keeps.
         """
-        length = _ENTRY.size + len(content)
-        at, skipped = self._at, 0
-        if at + length > self._size:
-            skipped = self._size - at
-        if self._written + skipped + length - self._numbers[_READ] > self._size:
-            self._numbers[_REFUSED] += 1
+        length = len(content)
+        end = self._at + _HEAD + length
+        if end > self._until:
+            if not self._make_room(_HEAD + length):
+                self._numbers[_REFUSED] += 1
+                return False
+            end = self._at + _HEAD + length
+        if length < _USUAL_BYTES:  # head and content in one call
+            _PACK[length](self._bytes, self._at, wall_ns, length, kind, content)
+        else:
+            _ENTRY.pack_into(self._bytes, self._at, wall_ns, length, kind)
+            self._bytes[end - length : end] = content
+        self._at = end
+        self._numbers[_WRITTEN] = self._before + end
+        return True
+
+    def _make_room(self, wanted: int) -> bool:
+        """Look how far the reader is, and pass the ring's end where an entry does not fit before it."""
+        if self._closed:
+            return False
+        at, free = self._at, self._size - (self._before + self._at - self._numbers[_READ])
+        skipped = self._size - at if at + wanted > self._size else 0
+        if skipped + wanted > free:
             return False
         if skipped:
-            if skipped >= _ENTRY.size:
+            if skipped >= _HEAD:
                 _ENTRY.pack_into(self._bytes, at, 0, _SKIP, 0)
-            at = 0
-        _ENTRY.pack_into(self._bytes, at, wall_ns, len(content), kind)
-        self._bytes[at + _ENTRY.size : at + length] = content
-        self._at = at + length
-        self._written += skipped + length
-        self._numbers[_WRITTEN] = self._written
-        self.put_count += 1
+            self._before += self._size
+            self._at, free = 0, free - skipped
+        self._until = min(self._size, self._at + free)
         return True
+
+    def close(self) -> None:
+        """Refuse what still comes, and count it: nobody reads any more."""
+        self._closed = True
+        self._until = 0
+
+    @property
+    def waiting(self) -> int:
+        """Entries that the reader has not taken."""
+        done, end, count = self._numbers[_READ], self._before + self._at, 0
+        while done < end:
+            at = done % self._size
+            length = _ENTRY.unpack_from(self._bytes, at)[1] if self._size - at >= _HEAD else _SKIP
+            done += self._size - at if length == _SKIP else _HEAD + length
+            count += length != _SKIP
+        return count
 
 
 class RingReader(_Ring):
@@ -129,16 +164,16 @@ class RingReader(_Ring):
         while self._done < limit:
             at = self._done % self._size
             left = self._size - at
-            if left < _ENTRY.size:
+            if left < _HEAD:
                 self._done += left
                 continue
             wall_ns, length, kind = _ENTRY.unpack_from(self._bytes, at)
             if length == _SKIP:
                 self._done += left
                 continue
-            begin = at + _ENTRY.size
+            begin = at + _HEAD
             entry = Entry(wall_ns, kind, bytes(self._bytes[begin : begin + length]))
-            self._done += _ENTRY.size + length
+            self._done += _HEAD + length
             self._numbers[_READ] = self._done
             self._numbers[_TAKEN] += 1
             yield entry

@@ -33,9 +33,10 @@ def test_what_was_put_comes_out_once_and_in_order(size, steps):
         else:
             got.extend(reader.take() if step == "take" else reader.take_rest())
             assert got == put[: len(got)]
+        assert writer.waiting == len(put) - len(got)
     got.extend(reader.take_rest())
     assert got == put
-    assert writer.put_count == writer.taken == len(put)
+    assert (writer.taken, writer.waiting) == (len(put), 0)
 
 
 def test_an_entry_is_taken_only_at_the_look_after_the_one_that_saw_it_announced():
@@ -57,3 +58,21 @@ def test_a_full_ring_refuses_and_goes_on_once_there_is_room():
     assert len(list(reader.take_rest())) == 4
     assert writer.put(0, b"0123456789", 0)
     assert not writer.put(0, bytes(101), 0)  # never fits
+
+
+def test_a_closed_ring_refuses_and_counts():
+    writer, reader = make(100)
+    assert writer.put(0, b"0123456789", 0)
+    writer.close()
+    assert not writer.put(0, b"", 0)
+    assert not writer.put(0, b"0", 0)
+    assert (writer.refused, writer.waiting) == (2, 1)
+    assert [entry.content for entry in reader.take_rest()] == [b"0123456789"]
+
+
+def test_entries_of_any_size_keep_their_content():
+    writer, reader = make(10_000)
+    for length in (0, 1, 639, 640, 641, 5000):
+        content = (bytes(range(256)) * 20)[:length]
+        assert writer.put(7, content, -5)
+        assert list(reader.take_rest()) == [Entry(-5, 7, content)]
