@@ -28,6 +28,12 @@ AXES: Final = ("#0b6fb8", "#d9580d", "#12805c")
 """North or forward, east or right, down."""
 ERRORS: Final = ("#0b6fb8", "#8250c4", "#c4337a", "#dd8a13")
 """e1 to e4."""
+ALARM: Final = "#d9580d"
+"""A guard that acted, a limit that was reached."""
+RESET: Final = "#8250c4"
+"""A reset of the autopilot's estimate."""
+_MARKS_MOST: Final = 60
+"""More marks than this would only colour a figure."""
 _SHADE: Final = "rgba(71, 104, 145, 0.07)"
 _LABELLED: Final = 0.09
 _TIME: Final = "Time on the track [s]"
@@ -42,6 +48,14 @@ class Phase(NamedTuple):
     from_s: float
     to_s: float
     reason: str
+
+
+class Mark(NamedTuple):
+    """Something that happened at an instant of the figures' time axis."""
+
+    at_s: float
+    colour: str
+    text: str
 
 
 def thin(series: Array, buckets: int = BUCKETS) -> npt.NDArray[np.intp]:
@@ -133,8 +147,10 @@ def base_layout() -> dict[str, Any]:
     }
 
 
-def time_layout(time_s: Array, phases: Sequence[Phase], titles: Sequence[str]) -> dict[str, Any]:
-    """A layout of rows over one time axis, with a legend over each row and the phases behind all of them."""
+def time_layout(
+    time_s: Array, phases: Sequence[Phase], titles: Sequence[str], marks: Sequence[Mark] = ()
+) -> dict[str, Any]:
+    """A layout of rows over one time axis, with a legend over each row, and phases and marks behind all of them."""
     rows = len(titles)
     gap = 0.0 if rows == 1 else 0.30 / rows
     height = (1.0 - gap * (rows - 1)) / rows
@@ -150,6 +166,9 @@ def time_layout(time_s: Array, phases: Sequence[Phase], titles: Sequence[str]) -
             **{"bgcolor": "rgba(255,255,255,0)", "font": {"size": 12}, "itemwidth": 30},
         }
     layout["shapes"], layout["annotations"] = _phase_marks(phases, ends)
+    for mark in marks[:_MARKS_MOST]:
+        place = {"type": "line", "x0": mark.at_s, "x1": mark.at_s, "yref": "paper", "y0": 0, "y1": 1, "layer": "below"}
+        layout["shapes"].append(place | {"line": {"color": mark.colour, "width": 1}})
     return layout
 
 

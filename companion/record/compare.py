@@ -88,7 +88,8 @@ def build_comparison(first: Path, second: Path, out: Path | None = None) -> Path
     for figure in FIGURES:
         keys = []
         for index, (flight, _) in enumerate(flights):
-            if figure.of_law and flight.summary.get("controller", "law") != "law":
+            by_law = flight.summary.get("controller", "law") == "law"
+            if (figure.of_law and not by_law) or not figure.shown(flight):
                 continue
             panel = {"key": f"{figure.key}-{'ab'[index]}", **figure.build(flight)}
             panel["layout"]["title"] = {

@@ -5,6 +5,7 @@ Each function takes the flight and returns a figure as a plain dictionary in the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -23,13 +24,13 @@ from companion.record.charts import (
 )
 from companion.record.columns import TRACK_PHASE
 from companion.record.figures_path import path_in_space, plan_close, plan_view
-from companion.record.figures_vehicle import attitude, events, heading, rates, timing
+from companion.record.figures_vehicle import attitude, battery, events, heading, rates, timing
 from companion.record.flight_data import Figure, FlightData
 from companion.record.summary import SETTLED_BELOW_M, body_velocity
 
 
 def _time_layout(flight: FlightData, titles: Sequence[str]) -> dict[str, Any]:
-    return time_layout(flight.time_s, flight.phases, titles)
+    return time_layout(flight.time_s, flight.phases, titles, flight.marks)
 
 
 def _norms(flight: FlightData, *names: str) -> Array:
@@ -91,8 +92,12 @@ def law_errors(flight: FlightData) -> dict[str, Any]:
     components = flight.record.columns("e1_n", "e1_e", "e1_d")
     data += lines(flight.time_s, components, ["north", "east", "down"], AXES, row=2)
     lyapunov = flight.record.columns("lyapunov")
-    layout["yaxis3"] |= logarithmic(lyapunov)
+    bound = np.full((len(flight.record), 1), flight.envelope_m2)
+    bound[~np.isfinite(lyapunov)] = math.nan
+    layout["yaxis3"] |= logarithmic(np.concatenate((lyapunov, bound)))
     data += lines(flight.time_s, lyapunov, ["V, without the estimate's own error"], [INK], row=3)
+    if np.isfinite(bound).any():
+        data += lines(flight.time_s, bound, ["envelope: V stays below, by the proof"], [FAINT], row=3, width=1.6)
     return {"data": data, "layout": layout}
 
 
@@ -124,8 +129,9 @@ FIGURES: Final = (
     Figure(
         "events",
         "Events",
-        "What happened when: the phases, the limits that acted, late and skipped steps.",
-        240,
+        "What happened when: phases, limits that acted, late and skipped steps, guards, resets, and what was said. "
+        "Guards (orange) and resets (violet) are lines in all figures over time.",
+        300,
         events,
     ),
     Figure(
@@ -169,7 +175,7 @@ FIGURES: Final = (
         "errors",
         "Figure 4: the four errors",
         "Position, velocity, acceleration and jerk errors of the law at the predicted time, all scaled to metres, and "
-        "the Lyapunov function that bounds them.",
+        "the Lyapunov function that bounds them, below its envelope as long as the proof's conditions hold.",
         760,
         law_errors,
         of_law=True,
@@ -193,7 +199,8 @@ FIGURES: Final = (
     Figure(
         "attitude",
         "Attitude",
-        "Roll and pitch as received, and the tilt between the vehicle's axis and the vertical.",
+        "Roll, pitch and the tilt between the vehicle's axis and the vertical: as received, and (dotted) where the law "
+        "wants the thrust, so that the acceleration error e₃ would vanish.",
         520,
         attitude,
     ),
@@ -210,6 +217,14 @@ FIGURES: Final = (
         "By the wall clock: from a state's arrival to its setpoint's departure, and the state's age at that moment.",
         440,
         timing,
+    ),
+    Figure(
+        "battery",
+        "Battery",
+        "As the autopilot reported it.",
+        440,
+        battery,
+        shown=lambda flight: "t_s" in flight.battery and len(flight.battery["t_s"]) > 1,
     ),
 )
 """The figures in the order of the report."""

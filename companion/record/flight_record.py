@@ -1,6 +1,6 @@
 """The record of a flight: a preallocated table with one row per control step.
 
-The control loop writes it, so that writing costs about a microsecond, never allocates memory for a row, and cannot
+The control loop writes it, so that writing costs about a microsecond, never takes memory that stays, and cannot
 end a flight: rows beyond the capacity are counted and left out.
 """
 

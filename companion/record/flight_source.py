@@ -20,11 +20,12 @@ import numpy as np
 from companion.errors import InputError
 from companion.record import topics
 from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES
+from companion.record.flight_data import Message
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, read_summary
 from companion.record.summary import FlightMeta, PhaseChange, note_end, summarise
 from companion.record.ulog import ULOG_FILE, Level, Topic
-from companion.record.ulog_file import Array, LogFile, read_ulog
+from companion.record.ulog_file import Array, LogFile, read_seldom, read_ulog
 
 TRUTH_FILE: Final = "truth.csv"
 """Written by the simulated vehicle: what really happened, on the clock of the record's `t_s`."""
@@ -48,6 +49,10 @@ class FlightSource:
     """Columns of the simulated vehicle's truth.csv; empty when there is none."""
     missing: tuple[str, ...] = ()
     """What could not be read, a sentence each."""
+    battery: Mapping[str, Array] = field(default_factory=dict)
+    """The topic battery_status of the log, with `t_s`; empty without one."""
+    messages: tuple[Message, ...] = ()
+    """What was said during the flight, from the log."""
 
     @property
     def folder(self) -> Path:
@@ -72,13 +77,30 @@ def read_source(path: Path) -> FlightSource:
         told = f"{absent}: not there, the control process did not come to its end; this is read from {ULOG_FILE}"
         return replace(source, path=path, truth=_read_truth(path / TRUTH_FILE), missing=(told, *source.missing))
     configuration = path / CONFIGURATION_FILE
+    record = FlightRecord.load(path)
+    missing: tuple[str, ...] = ()
+    battery: dict[str, Array] = {}
+    messages: tuple[Message, ...] = ()
+    if (path / ULOG_FILE).is_file():
+        try:
+            log = read_seldom(path / ULOG_FILE, [topics.BATTERY.name])
+            battery, messages, missing = (
+                _battery(log),
+                _messages(log),
+                tuple(f"{ULOG_FILE}: {said}" for said in log.missing),
+            )
+        except InputError as error:
+            missing = (str(error),)
     return FlightSource(
         path,
-        FlightRecord.load(path),
+        record,
         read_summary(path),
         _read_configuration(configuration),
         str(configuration),
         _read_truth(path / TRUTH_FILE),
+        missing,
+        battery,
+        messages,
     )
 
 
@@ -123,7 +145,7 @@ def _read_truth(path: Path) -> dict[str, Array]:
 
 
 def _from_log(path: Path) -> FlightSource:
-    log = read_ulog(path, [topic.name for topic in (*topics.STEP_TOPICS, topics.LINK)])
+    log = read_ulog(path, [topic.name for topic in (*topics.STEP_TOPICS, topics.LINK, topics.BATTERY)])
     if not log.info and not log.topics:
         raise InputError(f"{path}: ends within its definitions; nothing of the flight is in it")
     if not log.is_ours:
@@ -141,7 +163,24 @@ def _from_log(path: Path) -> FlightSource:
     if dropped is not None and dropped[-1]:
         missing.append(f"{dropped[-1]} entries never reached the log: its writer was too slow")
     summary = _summary(log, record, configuration, outcome)
-    return FlightSource(path, record, summary, configuration, f"{path} (flight_toml)", missing=tuple(missing))
+    return FlightSource(
+        *(path, record, summary, configuration, f"{path} (flight_toml)"),
+        missing=tuple(missing),
+        battery=_battery(log),
+        messages=_messages(log),
+    )
+
+
+def _battery(log: LogFile) -> dict[str, Array]:
+    """The battery's topic, where it is whole."""
+    name = topics.BATTERY.name
+    if name not in log.topics:
+        return {}
+    return {"t_s": log.time_s(name)} | {entry: log.column(name, entry) for entry in log.topics[name]}
+
+
+def _messages(log: LogFile) -> tuple[Message, ...]:
+    return tuple(Message(1e-6 * t_us, level, text) for level, t_us, text in log.texts)
 
 
 def _record(log: LogFile, missing: list[str]) -> FlightRecord:

@@ -14,14 +14,17 @@ from companion.errors import InputError
 from companion.record.columns import LIMIT_NAMES, TRACK_PHASE
 from companion.record.figures import FIGURES
 from companion.record.flight_data import FlightData
+from companion.record.flight_log import envelope
 from companion.record.flight_record import FlightRecord
 from companion.record.flight_source import FlightSource, read_source
 from companion.record.folder import write_whole
 from companion.record.page import compose
 from companion.record.summary import PASSED
+from companion.record.ulog import Level
 
 REPORT_FILE: Final = "report.html"
 _ROTORS: Final = 4
+_MESSAGES_SHOWN: Final = 200
 
 
 def build_report(flown: FlightSource | Path, out: Path | None = None) -> Path:
@@ -50,6 +53,7 @@ def read_flight(flown: FlightSource | Path) -> tuple[FlightData, dict[str, Any]]
     read = read_source(flown) if isinstance(flown, Path) else flown
     configuration = read.configuration
     mass_kg = next((value for value in _find(configuration, "mass_kg") if isinstance(value, int | float)), None)
+    gains = _merged(configuration, "controller")
     flight = FlightData(
         record=read.record,
         summary=read.summary,
@@ -59,8 +63,27 @@ def read_flight(flown: FlightSource | Path) -> tuple[FlightData, dict[str, Any]]
         thrust_full_n=_rotors(configuration)[0],
         curve_factor=_rotors(configuration)[1],
         missing=read.missing,
+        gains=gains,
+        envelope_m2=_envelope(read.record, configuration),
+        battery=read.battery,
+        messages=read.messages,
+        guards=_guard_sentences(),
     )
     return flight, configuration
+
+
+def _envelope(record: FlightRecord, configuration: Mapping[str, Any]) -> float:
+    """The envelope of the Lyapunov function, as the log has it: from the first step."""
+    if not len(record):
+        return math.nan
+    b_hat = record.columns("b_hat_n", "b_hat_e", "b_hat_d")[0]
+    return envelope(configuration, float(record.column("lyapunov")[0]), [float(x) for x in b_hat])
+
+
+def _guard_sentences() -> frozenset[str]:
+    from companion.flight.guards import Guard
+
+    return frozenset(guard.value.cause.value.sentence for guard in Guard)
 
 
 def flight_name(configuration: Mapping[str, Any], source: Path) -> str:
@@ -125,7 +148,7 @@ def _figures(flight: FlightData) -> tuple[list[dict[str, Any]], str]:
     sections = []
     by_law = _by_law(flight.summary)
     for figure in FIGURES:
-        if figure.of_law and not by_law:
+        if (figure.of_law and not by_law) or not figure.shown(flight):
             continue
         panels = [{"key": figure.key, **figure.build(flight)}]
         if figure.close is not None and (close := figure.close(flight)) is not None:
@@ -236,6 +259,12 @@ def _tables(flight: FlightData, configuration: Mapping[str, Any]) -> str:
     ]
     reached = [(LIMIT_NAMES[bit], share) for bit, share in _limit_shares(flight.record)]
     tables = [listing("Phases", ("phase", "from, s", "because"), phases)]
+    said = [
+        (_number(message.at_s - flight.start_s), message.text)
+        for message in flight.messages
+        if flight.kind_of(message) and message.level <= Level.NOTICE
+    ]
+    tables.append(listing("Messages", ("at, s", "text"), said[-_MESSAGES_SHOWN:]))
     if _by_law(flight.summary):
         gains = listing("Gains used", ("gain", "value"), _settings(_merged(configuration, "controller")))
         tables.append(listing("Limits reached on the track", ("limit", "share of the steps"), reached, empty="None."))

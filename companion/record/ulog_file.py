@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +25,8 @@ Columns = Mapping[str, npt.NDArray[Any]]
 _MAGIC: Final = b"ULog\x01\x12\x35"
 _HEADER_BYTES: Final = 16
 _HEAD_BYTES: Final = 3
+_KINDS: Final = frozenset(b"BFIMPQARDLCSO")
+_DATA, _ADD = b"DA"
 _ATTEMPTS: Final = 4
 _ROUNDS: Final = 8
 _ROUNDS_BYTES: Final = 1 << 20
@@ -125,6 +127,10 @@ def read_ulog(path: Path, topics: Sequence[str] | None = None) -> LogFile:
         log, failure = _parsed(watched, topics)
     if log is None:
         raise InputError(f"{path}: cannot be read as a ULog ({failure}); it is damaged, try another copy of it")
+    return _log_file(path, log, tuple(_missing(log, watched, size)))
+
+
+def _log_file(path: Path, log: Any, missing: tuple[str, ...]) -> LogFile:
     return LogFile(
         path=path,
         topics={data.name: data.data for data in log.data_list if data.multi_id == 0 and "timestamp" in data.data},
@@ -132,11 +138,59 @@ def read_ulog(path: Path, topics: Sequence[str] | None = None) -> LogFile:
         texts=[(said.log_level - ord("0"), said.timestamp, said.message) for said in log.logged_messages],
         long_info={key: [_joined(parts) for parts in entry] for key, entry in log.msg_info_multiple_dict.items()},
         parameters={**log.initial_parameters, **{name: value for _, name, value in log.changed_parameters}},
-        missing=tuple(_missing(log, watched, size)),
+        missing=missing,
     )
 
 
-def _check_head(path: Path, file: io.BufferedReader, size: int) -> None:
+def read_seldom(path: Path, topics: Sequence[str]) -> LogFile:
+    """Read what comes seldom in a log, its texts and facts and a few topics, without looking at the rest of its data:
+    ten times as fast as all of it.
+
+    Raises:
+        InputError: as of `read_ulog`.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a flight's folder or a ULog") from None
+    with io.BytesIO(content) as file:
+        _check_head(path, file, len(content))
+    kept, torn = _without_data(content, {name.encode() for name in topics})
+    log, failure = None, ""
+    try:
+        from pyulog import ULog
+
+        with contextlib.redirect_stdout(io.StringIO()):
+            log = ULog(io.BytesIO(kept), list(topics))
+    except Exception as error:
+        failure = f"{type(error).__name__}: {error}"
+    if log is None:
+        raise InputError(f"{path}: cannot be read as a ULog ({failure}); it is damaged, try another copy of it")
+    lost = (f"the log ends inside a message ({torn} bytes of it), or is damaged there",) if torn else ()
+    return _log_file(path, log, lost)
+
+
+def _without_data(content: bytes, topics: Collection[bytes]) -> tuple[bytes, int]:
+    """A log without the data of other topics than these, and how many bytes are left behind its last whole message."""
+    wanted: set[bytes] = set()
+    kept, at, end, begin = bytearray(), _HEADER_BYTES, len(content), 0
+    while at + _HEAD_BYTES <= end:
+        after = at + _HEAD_BYTES + (content[at] | content[at + 1] << 8)
+        kind = content[at + 2]
+        if after > end or kind not in _KINDS:
+            break
+        if kind == _DATA:
+            if content[at + 3 : at + 5] not in wanted:
+                kept += content[begin:at]
+                begin = after
+        elif kind == _ADD and content[at + 6 : after] in topics:
+            wanted.add(content[at + 4 : at + 6])
+        at = after
+    kept += content[begin:at]
+    return bytes(kept), end - at
+
+
+def _check_head(path: Path, file: io.BufferedIOBase, size: int) -> None:
     """Raises InputError for what is not the beginning of a ULog."""
     head = file.read(_HEADER_BYTES)
     file.seek(0)

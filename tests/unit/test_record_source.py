@@ -18,6 +18,7 @@ from companion.cli import app, main
 from companion.errors import InputError
 from companion.flight.phases import Cause, Engagement, Outcome
 from companion.record import ulog
+from companion.record.columns import COLUMN_INDEX
 from companion.record.compare import table
 from companion.record.figures import FIGURES
 from companion.record.flight_log import Entry, FlightLog
@@ -55,6 +56,13 @@ def frames(t_us: int) -> list[bytes]:
     none = [0.0] * 21
     odometry = mavlink2.MAVLink_odometry_message(t_us, 1, 1, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, none, none)
     return [mavlink2.MAVLink_heartbeat_message(2, 12, 81, 0, 4, 3).pack(link), odometry.pack(link)]
+
+
+def battery(remaining: int) -> bytes:
+    """What is left, in percent, at 15.2 V and an unknown current."""
+    link = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
+    cells = [3800] * 4 + [65535] * 6
+    return bytes(mavlink2.MAVLink_battery_status_message(0, 0, 1, 32767, cells, -1, -1, -1, remaining).pack(link))
 
 
 class Log(bytes):
@@ -152,6 +160,77 @@ def test_the_folders_own_files_come_first(tmp_path: Path, record: FlightRecord, 
     written(tmp_path / "flight.ulg", whole)
     source = read_source(tmp_path)
     assert (len(source.record), source.configuration, source.missing) == (50, {"name": "folder"}, ())
+
+
+RESET = "the autopilot's estimate was reset: moved by 0.30 m; the reference moves along"
+GUARD = "the reference slows down to 50 % of its pace: the thrust is at its limit: at 80 N for 0.5 s"
+WORDS = "autopilot: low <battery>"
+
+
+def test_battery_and_messages_come_from_the_log_of_a_folder_or_alone(tmp_path: Path, record: FlightRecord) -> None:
+    """And the report shows them: guards and resets in every figure over time, the rest in the events' band."""
+    settings_ = CONFIGURATION + "[vehicle.controller]\nk1_1_s = 0.5\nk2 = 4.0\ngamma_1_s3 = 2.0\n"
+    log = FlightLog(settings_ + "[vehicle.limits]\ndisturbance_max_m_s2 = 3.0\n", 0)
+    parts = [log.take(Direction.IN, raw, 1) for raw in frames(99_000_000)]
+    for index, row in enumerate(record.rows):
+        if index % 100 == 0:
+            parts += [
+                log.take(Direction.IN, raw, 1) for raw in (*frames(round(1e6 * row[0])), battery(90 - index // 100))
+            ]
+        parts.append(log.take(Entry.ROW, row.tobytes(), 0))
+        if index in {400, 500, 600}:
+            said = {400: RESET, 500: GUARD, 600: WORDS}[index]
+            parts.append(log.take(Entry.TEXT, bytes((Level.NOTICE,)) + said.encode(), 0))
+    content = b"".join((*parts, log.end()))
+    alone = read_source(written(tmp_path / "alone.ulg", content))
+    record.save(tmp_path)
+    write_summary(tmp_path, alone.summary)
+    write_configuration(tmp_path, alone.configuration)
+    written(tmp_path / "flight.ulg", content)
+    folder = read_source(tmp_path)
+    assert folder.missing == ()
+    assert folder.messages == alone.messages
+    assert [(message.at_s, message.text) for message in folder.messages if message.level == Level.NOTICE] == [
+        *((105.0, RESET), (106.0, GUARD), (107.0, WORDS))
+    ]
+    assert folder.battery.keys() == alone.battery.keys()
+    assert all(np.array_equal(folder.battery[name], alone.battery[name], equal_nan=True) for name in folder.battery)
+    assert folder.battery["remaining"][:3] == pytest.approx([0.90, 0.89, 0.88])
+    assert folder.battery["voltage_v"] == pytest.approx(15.2)
+
+    flight, _ = read_flight(folder)
+    figures = {figure.key: figure.build(flight) for figure in FIGURES if figure.shown(flight)}
+    rows = {trace["name"]: trace for trace in figures["events"]["data"] if trace["type"] == "scatter"}
+    assert {name: trace["x"] for name, trace in rows.items() if name != "messages"} == {
+        **{"resets": [pytest.approx(1.0)], "guards": [pytest.approx(2.0)], "autopilot's words": [pytest.approx(3.0)]}
+    }
+    assert rows["autopilot's words"]["text"] == ["autopilot: low &lt;battery&gt;"]
+    for figure in figures.values():
+        if figure["layout"].get("meta"):
+            drawn = [shape["x0"] for shape in figure["layout"]["shapes"] if shape.get("line", {}).get("width") == 1]
+            assert {1.0, 2.0} <= {round(x, 3) for x in drawn}
+    names = [trace["name"] for trace in figures["battery"]["data"]]
+    assert names == ["voltage", "current", "left"]
+    bound = next(trace for trace in figures["errors"]["data"] if trace["name"].startswith("envelope"))
+    first = record.rows[0]
+    value, b_hat = first[COLUMN_INDEX["lyapunov"]], record.columns("b_hat_n", "b_hat_e", "b_hat_d")[0]
+    assert np.nanmax(bound["y"]) == pytest.approx(value + (3.0 + np.linalg.norm(b_hat)) ** 2 / 2.0, rel=1e-6)
+    text = build_report(folder).read_text(encoding="utf-8")
+    assert "the thrust is at its limit: at 80 N" in text
+    assert "low <battery>" not in text
+
+
+def test_a_folder_whose_log_is_damaged_is_shown_without_what_only_the_log_has(
+    tmp_path: Path, record: FlightRecord, whole: bytes
+) -> None:
+    record.save(tmp_path)
+    write_summary(tmp_path, {"verdict": "passed"})
+    for content, said in ((b"", "is empty"), (b"no log" * 9, "is no ULog"), (whole[:-7], "ends inside a message")):
+        source = read_source(written(tmp_path / "flight.ulg", content).parent)
+        assert len(source.record) == len(record)
+        assert len(source.missing) == 1
+        assert "flight.ulg" in source.missing[0]
+        assert said in source.missing[0]
 
 
 @settings(max_examples=60, deadline=None)
