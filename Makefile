@@ -29,12 +29,12 @@ $(VENV)/.run: pyproject.toml constraints.txt | $(PY)
 
 $(VENV)/.test: pyproject.toml constraints.txt | $(PY)
 	@echo "installing into $(VENV), with what the tests need ..."
-	@$(PIP_INSTALL) -e '.[test,fast]'
+	@$(PIP_INSTALL) -e '.[test,campaign]'
 	@touch $(VENV)/.run $@
 
 $(VENV)/.lint: pyproject.toml constraints.txt | $(PY)
 	@echo "installing into $(VENV), with what the checks need ..."
-	@$(PIP_INSTALL) -e '.[test,fast,lint]'
+	@$(PIP_INSTALL) -e '.[test,campaign,lint]'
 	@touch $(VENV)/.run $(VENV)/.test $@
 
 demo: $(VENV)/.run  ## Fly the paper's figure of eight on the bundled vehicle

@@ -26,8 +26,8 @@ from companion.errors import InputError
 ENGINES = ("auto", "python", "numba")
 """What `resolve` understands."""
 
-_PACKAGES = ("companion",)
-"""Functions of this package are compiled with the function that calls them."""
+_PACKAGES = ("companion", "sim_link")
+"""Functions of these packages are compiled with the function that calls them."""
 _CONSTANTS = (bool, int, float, str, tuple)
 """Types of globals that become part of the compiled code."""
 _compiled: dict[FunctionType, Any] = {}

@@ -311,7 +311,13 @@ def with_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     return out
 
 
-_SINGULAR = {"vehicles": "vehicle", "trajectories": "trajectory", "flights": "flight", "faults": "fault"}
+_SINGULAR = {
+    "vehicles": "vehicle",
+    "trajectories": "trajectory",
+    "flights": "flight",
+    "faults": "fault",
+    "campaigns": "study",
+}
 
 
 def find(name: str, kind: str) -> Path:
@@ -319,7 +325,7 @@ def find(name: str, kind: str) -> Path:
 
     Args:
         name: a path, or a bundled file's name without ending.
-        kind: "vehicles", "trajectories", "flights" or "faults".
+        kind: "vehicles", "trajectories", "flights", "faults" or "campaigns".
 
     Raises:
         InputError: there is neither.

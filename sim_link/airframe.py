@@ -20,6 +20,11 @@ _GUST_PERIOD_S = 0.01
 """At least so often the gusts change; on a fixed grid of steps, however the steps are asked for."""
 
 
+def steps_per_gust(dt_us: int) -> int:
+    """Return for how many steps of dt_us the air stays as it is."""
+    return max(1, round(_GUST_PERIOD_S / (dt_us * 1.0e-6)))
+
+
 class Truth(NamedTuple):
     """What really happens."""
 
@@ -81,7 +86,7 @@ class Airframe:
         """How old an estimate is when it is published."""
         gravity = STANDARD_GRAVITY_M_S2 * world.gravity_factor
         self._body = make_body(vehicle, gravity)
-        self._steps_per_gust = max(1, round(_GUST_PERIOD_S / (self.dt_us * 1.0e-6)))
+        self._steps_per_gust = steps_per_gust(self.dt_us)
         self._gust_phase = 0
         """Steps since the gusts changed last, or would have changed."""
         period_s = self._steps_per_gust * (self.dt_us * 1.0e-6)

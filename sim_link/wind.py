@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import MutableSequence, Sequence
 from dataclasses import dataclass
 
 from .rotation import Vec3
@@ -17,6 +18,8 @@ from .rotation import Vec3
 _FOOT_M = 0.3048
 _ALTITUDE_MIN_M, _ALTITUDE_MAX_M = 3.0, 304.8
 """Where the low-altitude formulas hold (10 to 1000 ft)."""
+DRAWS_PER_PERIOD = 5
+"""Random numbers that the gusts of one period take."""
 _STILL_M_S = 1.0e-6
 """Mean wind below which there is no direction and, the intensity being a share of it, no turbulence."""
 
@@ -59,6 +62,10 @@ class _LongGust:
         """Go one period on."""
         self.value_m_s = self._kept * self.value_m_s + self._added * self._draw.gauss(0.0, 1.0)
 
+    def numbers(self) -> tuple[float, ...]:
+        """Return factors and value."""
+        return (self._kept, self._added, self.value_m_s)
+
 
 class _CrossGust:
     """Second-order Dryden filter K (1 + sqrt(3) s/a) / (1 + s/a)^2: the gusts across the mean wind, a = V/L.
@@ -95,6 +102,39 @@ class _CrossGust:
         self._x1 = f11 * x1 + f12 * x2 + n11 * g1 + n12 * g2
         self._x2 = f21 * x1 + f22 * x2 + n22 * g2
         self.value_m_s = self._out[0] * self._x1 + self._out[1] * self._x2
+
+    def numbers(self) -> tuple[float, ...]:
+        """Return transition, noise, output and state."""
+        return (*self._phi, *self._noise, *self._out, self._x1, self._x2)
+
+
+def series(f: Sequence[float], draws: Sequence[float], air: MutableSequence[float]) -> None:
+    """Write the velocity of the air of as many periods as `air` holds: what `Wind.advance` gives, to the bit.
+
+    Scalar code on flat arrays, as the other kernels: campaigns have millions of periods.
+
+    Args:
+        f: `Wind.filters`.
+        draws: `Wind.draws`, for all periods but the first.
+        air: gets north, east, down of every period, the present one first.
+    """
+    u = f[7]
+    v1, v2, w1, w2 = f[17], f[18], f[28], f[29]
+    v = f[15] * v1 + f[16] * v2
+    w = f[26] * w1 + f[27] * w2
+    for i in range(len(air) // 3):
+        if i > 0:
+            d = DRAWS_PER_PERIOD * (i - 1)
+            u = f[5] * u + f[6] * draws[d]
+            g1, g2 = draws[d + 1], draws[d + 2]
+            v1, v2 = f[8] * v1 + f[9] * v2 + f[12] * g1 + f[13] * g2, f[10] * v1 + f[11] * v2 + f[14] * g2
+            v = f[15] * v1 + f[16] * v2
+            g1, g2 = draws[d + 3], draws[d + 4]
+            w1, w2 = f[19] * w1 + f[20] * w2 + f[23] * g1 + f[24] * g2, f[21] * w1 + f[22] * w2 + f[25] * g2
+            w = f[26] * w1 + f[27] * w2
+        air[3 * i] = f[0] + f[3] * u - f[4] * v
+        air[3 * i + 1] = f[1] + f[4] * u + f[3] * v
+        air[3 * i + 2] = f[2] + w
 
 
 class Wind:
@@ -138,6 +178,21 @@ class Wind:
         for gust in self._gusts:
             gust.advance()
         self.air_m_s = self._sum()
+
+    def filters(self) -> tuple[float, ...]:
+        """Return what `series` goes on from: 30 numbers, after which this wind must not be advanced.
+
+        Mean velocity and direction of the mean, then the long gust's factors and value, then of both cross gusts
+        transition, noise, output and state.
+        """
+        assert self._gusts is not None
+        u, v, w = self._gusts
+        return (*self._mean, *self._along, *u.numbers(), *v.numbers(), *w.numbers())
+
+    def draws(self, count: int) -> list[float]:
+        """Return the next `count` standard normal numbers of the gusts, DRAWS_PER_PERIOD for every period."""
+        gauss = self._draw.gauss
+        return [gauss(0.0, 1.0) for _ in range(count)]
 
     def _new_gusts(self, speed: float, turbulence: float) -> tuple[_LongGust, _CrossGust, _CrossGust]:
         north, east, _ = self._mean

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from companion.campaign import ideal
+from companion.campaign.whole import simulated
 from companion.config import Flight
 from companion.control import flat
 from companion.control.heading import HeadingState
@@ -89,21 +90,9 @@ def start_of(flight: Flight) -> tuple[Vec3, float]:
     return flight.start.position_m, radians(flight.start.yaw_deg)
 
 
-def _lists(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _lists(item) for key, item in value.items()}
-    if isinstance(value, tuple):
-        return list(value)
-    return value
-
-
 def simulated_vehicle(flight: Flight) -> vehicle_file.VehicleFile:
     """The flight's vehicle as the simulator builds it."""
-    data = _lists(flight.vehicle.model_dump(exclude_none=True))
-    try:
-        return vehicle_file.parse(data, f"vehicle {flight.vehicle.name!r}")
-    except vehicle_file.VehicleFileError as error:
-        raise InputError(str(error)) from None
+    return simulated(flight.vehicle)
 
 
 def simulated_world(flight: Flight) -> World:

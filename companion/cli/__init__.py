@@ -27,6 +27,7 @@ COMMANDS = {
     "doctor": "Look at a connected vehicle: would a flight be refused, and why.",
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
+    "campaign": "Fly thousands of simulated flights of a study, or one of them again.",
     "upload": "Bring a trajectory to the vehicle and get its verdict.",
     "list": "Show the trajectories on the vehicle.",
     "remove": "Remove a trajectory from the vehicle.",

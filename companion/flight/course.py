@@ -103,6 +103,11 @@ class Course:
         (x, y, z), (dx, dy, dz) = reference.p, self.moved_m
         return reference._replace(p=(x + dx, y + dy, z + dz))
 
+    @property
+    def pieces(self) -> tuple[tuple[float, Piece], ...]:
+        """Join (if there is one), trajectory and stop, as planned and at their own pace, each with its begin [s]."""
+        return tuple(zip(self._chain.starts_s, self._chain.pieces, strict=True))
+
     def shift(self, by_m: Vec3) -> None:
         """Moves all of it (NED): after the autopilot's estimate has jumped by as much."""
         (x, y, z), (dx, dy, dz) = self.moved_m, by_m

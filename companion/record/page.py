@@ -16,13 +16,13 @@ PAGE: Final = """<!DOCTYPE html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline'; \
 style-src 'unsafe-inline'; img-src data: blob:; font-src data:">
-<title>@@TITLE@@ – flight report</title>
+<title>@@TITLE@@ – @@KIND@@</title>
 <style>@@STYLE@@</style>
 </head>
 <body>
 <main>
 <header>
-<div><p class="kind">Flight report</p><h1>@@TITLE@@</h1><p class="subtitle">@@SUBTITLE@@</p></div>
+<div><p class="kind">@@KIND@@</p><h1>@@TITLE@@</h1><p class="subtitle">@@SUBTITLE@@</p></div>
 <p class="verdict @@VERDICT_CLASS@@">@@VERDICT@@</p>
 </header>
 <section class="thresholds">@@THRESHOLDS@@</section>
@@ -174,15 +174,22 @@ def compose(parts: Mapping[str, str], figures: Sequence[Mapping[str, Any]]) -> s
     """The whole page.
 
     Args:
-        parts: HTML for the marks TITLE, SUBTITLE, VERDICT, VERDICT_CLASS ("passed" or "missed"), THRESHOLDS, TILES,
-            FIGURES (with an element for each figure's key) and TABLES.
+        parts: HTML for the marks KIND (left out: "Flight report"), TITLE, SUBTITLE, VERDICT, VERDICT_CLASS ("passed" or
+            "missed"), THRESHOLDS, TILES, FIGURES (with an element for each figure's key) and TABLES.
         figures: what plotly.js draws: "key", "data" and "layout".
     """
     from plotly.offline import get_plotlyjs  # 3.6 MB of script
 
     # "</" would end the script element that holds the data.
     data = json.dumps(figures, default=_encode_array, allow_nan=False).replace("</", "<\\/")
-    filled = {**parts, "STYLE": STYLE, "PLOTLY": get_plotlyjs(), "DATA": data, "SCRIPT": SCRIPT}
+    filled = {
+        "KIND": "Flight report",
+        **parts,
+        "STYLE": STYLE,
+        "PLOTLY": get_plotlyjs(),
+        "DATA": data,
+        "SCRIPT": SCRIPT,
+    }
     # One pass over the template's own marks, so that nothing inside an inserted part is taken for a mark.
     pieces = PAGE.split("@@")
     return "".join(filled[piece] if index % 2 else piece for index, piece in enumerate(pieces))

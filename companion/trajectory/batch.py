@@ -1,14 +1,14 @@
 """References at many instants at once, for scans: the numbers of `at`, `flatness` and `torque` to rounding, as arrays.
 
-A scan of a long path looks at tens of thousands of instants; what is made of polynomials is evaluated for all of them
-together, everything else instant by instant.
+A scan of a long path, or a campaign's flight, looks at tens of thousands of instants; what is made of polynomials or
+sines is evaluated for all of them together, everything else instant by instant.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, pi
-from typing import NamedTuple
+from math import cos, inf, pi, sin
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,11 @@ from numpy.typing import NDArray
 from companion.trajectory import torque
 from companion.trajectory.anchored import Anchored, Trajectory
 from companion.trajectory.flatness import SPECIFIC_THRUST_MIN_M_S2, PointMass, ReferenceLimits
+from companion.trajectory.joins import Join
 from companion.trajectory.pieces import Piece
 from companion.trajectory.piecewise import Piecewise
+from companion.trajectory.polynomial import Coefficients, evaluate
+from companion.trajectory.shapes import ZERO, Circle, Helix, Hover, Lemniscate, Lissajous, Shape
 
 Array = NDArray[np.float64]
 
@@ -35,20 +38,87 @@ class Batch(NamedTuple):
     """Heading, its rate and its acceleration, shape (3, n)."""
 
 
-def batch(piece: Piece | Piecewise, times_s: Sequence[float]) -> Batch:
+def batch(piece: Piece | Piecewise, times_s: Sequence[float] | Array) -> Batch:
     """Return a piece at instants within its duration [s]."""
     t_s = np.array(times_s)
-    if isinstance(piece, Anchored) and isinstance(piece.trajectory.shape, Piecewise):
-        return _placed(piece, _of_trajectory(piece.trajectory, t_s))
-    if isinstance(piece, Trajectory) and isinstance(piece.shape, Piecewise):
-        return _of_trajectory(piece, t_s)
-    if isinstance(piece, Piecewise):
-        return _of_polynomials(piece, t_s)
+    found: Batch | None = None
+    if isinstance(piece, Anchored):
+        found = _of_trajectory(piece.trajectory, t_s)
+        found = None if found is None else _placed(piece, found)
+    elif isinstance(piece, Trajectory):
+        found = _of_trajectory(piece, t_s)
+    elif isinstance(piece, Piecewise):
+        found = _of_polynomials(piece, t_s)
+    elif isinstance(piece, Join):
+        found = _of_join(piece, t_s)
+    return _one_by_one(piece, t_s.tolist()) if found is None else found
+
+
+def _one_by_one(piece: Piece | Piecewise, times_s: Sequence[float]) -> Batch:
     references = [piece.at(t) for t in times_s]
     vectors = np.array([reference[:5] for reference in references])
     yaw = np.array([(r.yaw, r.yaw_rate, r.yaw_acceleration) for r in references])
     p, v, a, j, s = np.ascontiguousarray(vectors.transpose(1, 2, 0))
     return Batch(p, v, a, j, s, np.ascontiguousarray(yaw.T))
+
+
+def _of_join(piece: Join, t_s: Array) -> Batch:
+    t = np.clip(t_s, 0.0, piece.duration_s)
+    axes = [_rows(piece, axis, t) for axis in (piece.north, piece.east, piece.down)]
+    p, v, a, j, s = (np.stack([axis[k] for axis in axes]) for k in range(5))
+    return Batch(p, v, a, j, s, _rows(piece, piece.yaw, t)[:3])
+
+
+def _rows(piece: Join, axis: Coefficients, t_s: Array) -> Array:
+    # the polynomial's arithmetic is that of one instant, on all of them at once
+    found: tuple[Any, ...] = evaluate(axis, piece.duration_s, t_s)  # type: ignore[arg-type]
+    return np.stack([np.broadcast_to(row, t_s.shape) for row in found])
+
+
+def _sine(amplitude: float, w: float, angle: Array, ahead: float = 0.0) -> Array:
+    """amplitude sin(angle) and its first four derivatives, w the angle's rate; `ahead` 1: of the cosine."""
+    # the library's own sine: numpy's depends on the processor, and campaigns must not
+    s = amplitude * np.array([sin(x) for x in angle.tolist()])
+    c = amplitude * np.array([cos(x) for x in angle.tolist()])
+    w2 = w * w
+    if ahead:
+        return np.stack([c, -w * s, -w2 * c, w2 * w * s, w2 * w2 * c])
+    return np.stack([s, w * c, -w2 * s, -w2 * w * c, w2 * w2 * s])
+
+
+def _axes_of(shape: Shape, t_s: Array) -> list[Array] | None:
+    """Value and four derivatives of north, east and down, without the centre; None for a shape that is not known."""
+    zero = np.zeros((5, len(t_s)))
+    if isinstance(shape, Hover):
+        return [zero, zero, zero]
+    if isinstance(shape, Lemniscate):
+        w = shape.angular_rate_rad_s
+        north, east = shape.amplitude_m
+        return [_sine(north, w, w * t_s, 1.0), _sine(east, 2.0 * w, 2.0 * w * t_s), zero]
+    if isinstance(shape, Circle | Helix):
+        w = shape.angular_rate_rad_s
+        angle = w * t_s + shape.phase_rad
+        sinking = zero.copy()
+        if isinstance(shape, Helix):
+            sinking[0], sinking[1] = -shape.climb_m_s * t_s, -shape.climb_m_s
+        return [_sine(shape.radius_m, w, angle, 1.0), _sine(shape.radius_m, w, angle), sinking]
+    if isinstance(shape, Lissajous):
+        parts = zip(shape.amplitude_m, shape.angular_rate_rad_s, shape.phase_rad, strict=True)
+        return [_sine(amplitude, w, w * t_s + phase) for amplitude, w, phase in parts]
+    return None
+
+
+def _of_shape(shape: Shape, t_s: Array) -> Batch | None:
+    if isinstance(shape, Piecewise):
+        return _of_polynomials(shape, t_s)
+    axes = _axes_of(shape, t_s)
+    if axes is None:
+        return None
+    p, v, a, j, s = (np.stack([axis[k] for axis in axes]) for k in range(5))
+    centre = shape.point_m if isinstance(shape, Hover) else getattr(shape, "center_m", ZERO)
+    rate = np.full(len(t_s), shape.heading.yaw_rate_rad_s)
+    yaw = np.stack([shape.heading.yaw_rad + rate * t_s, rate, np.zeros(len(t_s))])
+    return Batch(p + np.array(centre)[:, None], v, a, j, s, yaw)
 
 
 def _of_polynomials(shape: Piecewise, t_s: Array) -> Batch:
@@ -58,10 +128,11 @@ def _of_polynomials(shape: Piecewise, t_s: Array) -> Batch:
     return Batch(p, v, a, j, s, shape.headings(inside))
 
 
-def _of_trajectory(trajectory: Trajectory, t_s: Array) -> Batch:
-    assert isinstance(trajectory.shape, Piecewise)
+def _of_trajectory(trajectory: Trajectory, t_s: Array) -> Batch | None:
     k = trajectory.time_scale
-    found = _of_polynomials(trajectory.shape, k * t_s)
+    found = _of_shape(trajectory.shape, k * t_s)
+    if found is None:
+        return None
     turned = found.yaw * np.array([[1.0], [k], [k * k]])
     return Batch(found.p, k * found.v, k**2 * found.a, k**3 * found.j, k**4 * found.s, turned)
 

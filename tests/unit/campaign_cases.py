@@ -1,0 +1,35 @@
+"""Small campaigns for tests: a study of seconds, in a file."""
+
+import os
+
+from companion.campaign.study import load_study
+
+TINY = """
+name = "tiny"
+flight = "eight"
+count = {count}
+seed = 3
+duration_s = {duration_s}
+
+[vary.start]
+north_m = {{ uniform = [1.0, 2.0] }}
+
+[vary.vehicle]
+mass_factor = {{ uniform = [0.95, 1.05] }}
+"""
+
+
+def tiny(folder, count=3, duration_s=0.5, more=""):
+    """A study of `count` flights."""
+    return load_study(str(tiny_file(folder, count, duration_s, more)))
+
+
+def tiny_file(folder, count=3, duration_s=0.5, more=""):
+    path = folder / "tiny.toml"
+    path.write_text(TINY.format(count=count, duration_s=duration_s) + more)
+    return path
+
+
+def die(*arguments):
+    """What a worker does that runs out of memory."""
+    os._exit(1)
