@@ -34,6 +34,7 @@ from .fleet import SPACING_M, SYSTEMS_MAX, Fleet, siblings
 from .parameters import ParameterError, Parameters
 from .peer import Peer, PeerOptions
 from .rotation import Vec3
+from .signing import KeyFileError, load_key
 from .truth_log import TruthLog
 from .vehicle import PX4_VERSIONS, Vehicle, VehicleError, VehicleOptions
 from .vehicle_file import VehicleFile, VehicleFileError, load
@@ -98,6 +99,9 @@ def run(
     faults: Annotated[
         str | None, typer.Option(metavar="FILE", help="What goes wrong: a fault file, or the name of a bundled one.")
     ] = None,
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Sign with the key in this file, and believe nobody else.")
+    ] = None,
     port: Annotated[int | None, typer.Option(help="Companion link, own port; 0: any free; default 14580 + i.")] = None,
     remote_port: Annotated[
         int | None, typer.Option(help="Companion link, port spoken to first; 0: none; default 14540 + i.")
@@ -121,11 +125,15 @@ def run(
     --truth FILE.csv, file (FILE-2.csv for system 2). Ports given by hand are the first vehicle's. In lockstep each
     follows its own companion.
 
+    With --key FILE, whose 32 bytes (raw or in hexadecimal) nobody else may read, all links are signed (MAVLink 2). A
+    vehicle without a key takes one by SETUP_SIGNING while it is disarmed.
+
     With --truth FILE.csv, what went wrong and when is written to FILE.faults.csv. docs/faults.md lists what can.
     """
     stop = Stop(with_parent)
     try:
         file = _vehicle_file(vehicle, state_rate, state_age)
+        secret, signing_time = (None, 0) if key is None else load_key(key)
         world = World(
             force_n=vector(force, "--force"),
             gravity_factor=number(gravity_factor, "--gravity-factor", above=0.0),
@@ -143,6 +151,8 @@ def run(
             engine=choice(engine, ENGINES, "--engine"),
             parameters=_parameters(param or [], px4),
             faults=() if faults is None else load_faults(faults, px4),
+            signing_key=secret,
+            signing_time=signing_time,
         )
         if instance + count > SYSTEMS_MAX:
             raise InputError(f"--count {count}: from --instance {instance} on there are {SYSTEMS_MAX - instance}")
@@ -166,7 +176,7 @@ def run(
         runner, peers = _open([Vehicle(o) for o in all_options], all_ports, stop)
         if truth is not None:
             _log_truth(peers, truth)
-    except (InputError, VehicleFileError, VehicleError, ParameterError, FaultError, ImportError) as error:
+    except (InputError, VehicleFileError, VehicleError, ParameterError, FaultError, KeyFileError, ImportError) as error:
         refuse(str(error))
     except OSError as error:  # a port, or the truth file
         refuse(str(error) if error.strerror is None else f"{error.filename}: {error.strerror}")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from fastcrc.crc16 import mcrf4xx
 
@@ -69,6 +69,7 @@ ID_ATTITUDE_TARGET = 83
 ID_TIMESYNC = 111
 ID_HIL_STATE_QUATERNION = 115
 ID_SERIAL_CONTROL = 126
+ID_SETUP_SIGNING = 256
 ID_SET_ACTUATOR_CONTROL_TARGET = 139
 ID_ODOMETRY = 331
 
@@ -200,31 +201,53 @@ def timesync(payload: bytes) -> tuple[int, int]:
     return tc1, ts1
 
 
+class Signatures(Protocol):
+    """What an encoder needs to sign."""
+
+    @property
+    def on(self) -> bool:
+        """Whether messages are signed now."""
+        ...
+
+    def tail(self, frame: bytes) -> bytes:
+        """Give the signature of a frame that has the signed flag set."""
+        ...
+
+
 class Encoder:
     """Builds the frames of one link; every link counts its own sequence numbers."""
 
-    def __init__(self, system: int, component: int) -> None:
+    def __init__(self, system: int, component: int, signatures: Signatures | None = None) -> None:
         self.system = system
         self.component = component
         self.sequence = 0
         self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._signatures = signatures
 
     def hot(self, msg_id: int, payload: bytes) -> bytes:
         """Frame a payload packed with one of the structs above."""
         crc_extra = _CHECKED[msg_id][0]
         body = payload.rstrip(b"\0") or payload[:1]
+        signatures = self._signatures
+        signed = signatures is not None and signatures.on
         head = _HEADER.pack(
-            MAGIC_V2, len(body), 0, 0, self.sequence, self.system, self.component, msg_id & 0xFFFF, msg_id >> 16
+            MAGIC_V2, len(body), signed, 0, self.sequence, self.system, self.component, msg_id & 0xFFFF, msg_id >> 16
         )
         self.sequence = (self.sequence + 1) & 0xFF
         head += body
-        return head + mcrf4xx(head[1:] + crc_extra).to_bytes(2, "little")
+        head += mcrf4xx(head[1:] + crc_extra).to_bytes(2, "little")
+        return head + signatures.tail(head) if signed and signatures is not None else head
 
     def cold(self, message: Any) -> bytes:
         """Frame a pymavlink message."""
         self._mav.seq = self.sequence
         self.sequence = (self.sequence + 1) & 0xFF
-        return bytes(message.pack(self._mav))
+        raw = bytes(message.pack(self._mav))
+        if self._signatures is None or not self._signatures.on:
+            return raw
+        body = raw[:2] + bytes((raw[2] | SIGNED_FLAG,)) + raw[3:-2]
+        body += mcrf4xx(body[1:] + _CHECKED[message.get_msgId()][0]).to_bytes(2, "little")
+        return body + self._signatures.tail(body)
 
 
 class Decoder:

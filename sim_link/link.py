@@ -10,6 +10,7 @@ from typing import Any
 from .codec import AUTOPILOT_COMPONENT, ID_HEARTBEAT, Encoder
 from .datagram_faults import LinkFaults
 from .link_rates import GROUND_HZ, ONBOARD_HZ
+from .signing import Keyring, LinkSigning
 
 __all__ = ["GROUND_HZ", "ONBOARD_HZ", "Link", "Stream"]
 
@@ -31,8 +32,19 @@ class Stream:
 class Link:
     """A link without its socket: whoever owns the socket sends what gathers in `outbox`."""
 
-    def __init__(self, system: int, rates_hz: Mapping[int, float], now_us: int, *, quiet: bool = False) -> None:
-        self.encoder = Encoder(system, AUTOPILOT_COMPONENT)
+    def __init__(
+        self,
+        system: int,
+        rates_hz: Mapping[int, float],
+        now_us: int,
+        *,
+        quiet: bool = False,
+        keyring: Keyring | None = None,
+        link_id: int = 0,
+    ) -> None:
+        self.signing = LinkSigning(keyring or Keyring(), link_id)
+        """Whom of those who send on it to believe."""
+        self.encoder = Encoder(system, AUTOPILOT_COMPONENT, self.signing)
         self.outbox: list[bytes] = []
         """Frames to send, one datagram each."""
         self.parameters_to_send: deque[str] = deque()

@@ -224,6 +224,8 @@ class Peer:
         if datagram[0][0].msg_id == ID_SERIAL_CONTROL:
             self._act(*datagram)
             return False
+        for frame in datagram[0]:
+            self.vehicle.companion.signing.learn_time(frame)  # or the first state would come from the past
         self._waiting.append(datagram)
         self._started = True
         return True
@@ -369,6 +371,8 @@ class Peer:
             answers = self._shell.take(frame, sender)
             self.companion.answer(answers, sender)
             return len(answers)
+        if not link.signing.accepts(frame):
+            return 0
         queued = len(link.outbox)
         if frame.msg_id == ID_TIMESYNC:
             self._timesync(frame, link, sender == self.companion.partner)
@@ -388,7 +392,6 @@ class Peer:
                 self.ground.answer(answers, sender)
                 intake.left -= len(answers)
                 continue
-            link.speak()
             queued = len(link.outbox)
             self._obey(frame, link)
             intake.left -= len(link.outbox) - queued
@@ -396,6 +399,9 @@ class Peer:
 
     def _obey(self, frame: Frame, link: Link) -> None:
         """Act on a message that is neither an order of faults nor part of the lockstep exchange."""
+        if not link.signing.accepts(frame):
+            return
+        link.speak()
         if frame.msg_id == ID_TIMESYNC:
             self._timesync(frame, link, False)
         else:

@@ -23,6 +23,7 @@ from .fault_file import load as load_faults
 from .fault_kinds import Fault
 from .faults import Faults
 from .peer import Peer, PeerOptions
+from .signing import KEY_LENGTH
 from .udp import LOOPBACK
 from .vehicle import Vehicle, VehicleOptions
 from .vehicle_file import load
@@ -58,6 +59,7 @@ class RunningVehicle:
         instance: int = 0,
         px4: str = "1.18",
         engine: str = "python",
+        key: bytes | None = None,
     ) -> None:
         """Start a vehicle on free ports.
 
@@ -79,6 +81,7 @@ class RunningVehicle:
             instance: its system id is 1 + instance.
             px4: whose behaviour: "1.18" or "1.13".
             engine: "python", "numba" or "auto".
+            key: 32 bytes: it signs what it sends, and believes only who does the same (MAVLink 2 signing).
 
         Raises:
             ValueError: one of these cannot be; the message says which.
@@ -107,6 +110,7 @@ class RunningVehicle:
                 engine=engine,
                 parameters=parameters or {},
                 faults=load_faults(str(faults), px4) if isinstance(faults, str | Path) else tuple(faults),
+                signing_key=_key(key),
             )
         )
         self.remote_port, self.ground_remote_port = _free_ports(2)
@@ -189,6 +193,16 @@ class RunningVehicle:
         return self._vehicle.autopilot.land.landed
 
     @property
+    def signing_key(self) -> bytes | None:
+        """The key that it signs with now; None: it signs nothing."""
+        return self._vehicle.keyring.key
+
+    @property
+    def signing_refused(self) -> Mapping[str, int]:
+        """Messages that were refused for their signature, by reason; what never was is 0."""
+        return self._vehicle.keyring.refused
+
+    @property
     def faults(self) -> Faults:
         """What goes wrong: `faults.inject("wind", for_s=3.0, wind_m_s=(0.0, 8.0, 0.0))`, `faults.end(number)`."""
         return self._vehicle.faults
@@ -264,6 +278,13 @@ def _pose(start: Sequence[float] | None) -> tuple[tuple[float, float, float], fl
             f"start = {start!r}: must be north, east, down (below 0: in the air) and, if wanted, a yaw [deg]"
         )
     return (values[0], values[1], values[2]), math.radians(values[3] if len(values) > 3 else 0.0)
+
+
+def _key(key: bytes | None) -> bytes | None:
+    """Check a signing key; the message does not show it."""
+    if key is not None and (len(key) != KEY_LENGTH or not any(key)):
+        raise ValueError(f"key: must be {KEY_LENGTH} bytes, not all of them zero")
+    return key
 
 
 def _within(name: str, value: float, low: float, high: float) -> float:

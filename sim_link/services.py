@@ -20,6 +20,7 @@ from .missions import MISSION
 from .modes import Mode, from_custom_mode
 from .offboard import PositionTarget
 from .parameters import HASH_CHECK, UINT32, ParameterError, Parameters
+from .signing import SETUP_SIGNING, Keyring, is_signed
 
 _PARAM_READ = struct.Struct("<hBB16s")
 _PARAM_LIST = struct.Struct("<BB")
@@ -53,8 +54,12 @@ class Services:
         *,
         system: int,
         failures: Failures | None = None,
+        keyring: Keyring | None = None,
     ) -> None:
-        """Serve one vehicle; `failures`: who knows which commands are refused, and lets units fail."""
+        """Serve one vehicle; `failures`: who knows which commands are refused, and lets units fail; `keyring`: its key.
+
+        Without a keyring, or where PX4 does not know SETUP_SIGNING yet, none can be set.
+        """
         self._autopilot = autopilot
         self._parameters = parameters
         self._system = system
@@ -87,6 +92,9 @@ class Services:
             mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: self._file_transfer,
         }
         self._handlers |= dict.fromkeys(self._missions.message_ids, self._mission)
+        if keyring is not None and autopilot.px4 != "1.13":
+            self._keyring = keyring
+            self._handlers[codec.ID_SETUP_SIGNING] = self._setup_signing
 
     def handle(self, frame: Frame, link: Link, now_us: int) -> None:
         """Act on one message; one that this vehicle has no use for is passed over."""
@@ -184,6 +192,20 @@ class Services:
             content = file_transfer.answer(payload[_FTP_TARGET:])
             head = bytes((0, frame.system, frame.component))
             link.send_hot(mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL, head + content)
+
+    def _setup_signing(self, frame: Frame, link: Link, now_us: int) -> None:
+        """SETUP_SIGNING: on any link and for any target, but not while armed; zeros, if they are signed, end it."""
+        initial, _, _, key = SETUP_SIGNING.unpack(codec.padded(frame.payload, SETUP_SIGNING.size))
+        if self._autopilot.armed:
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, "signing: no other key while armed")
+        elif initial or any(key):
+            self._keyring.change(key, initial)
+            self._say(mavlink.MAV_SEVERITY_INFO, "signing: new key")
+        elif self._keyring.key is None or is_signed(frame):
+            self._keyring.change(None, 0)
+            self._say(mavlink.MAV_SEVERITY_INFO, "signing: off")
+        else:
+            self._say(mavlink.MAV_SEVERITY_WARNING, "signing: only a signed message ends it")
 
     def _ping(self, frame: Frame, link: Link, now_us: int) -> None:
         """PING: a request to everybody is answered as it came."""

@@ -36,6 +36,7 @@ from .offboard import Order
 from .parameters import Parameters
 from .rotation import Vec3
 from .services import Services
+from .signing import Keyring
 from .vehicle_file import VehicleFile
 from .wind import World
 
@@ -118,6 +119,10 @@ class VehicleOptions:
     """Set before the start, over the defaults and what follows from the vehicle file."""
     faults: tuple[Fault, ...] = ()
     """What goes wrong, and when; their seed is `seed`."""
+    signing_key: bytes | None = field(default=None, repr=False)
+    """Messages are signed with it; 32 bytes."""
+    signing_time: int = 0
+    """The signing time that came with the key, in units of 10 us since 2015."""
 
 
 class Vehicle:
@@ -133,6 +138,10 @@ class Vehicle:
         """
         if options.px4 not in PX4_VERSIONS:
             raise VehicleError(f"px4 version {options.px4!r}: allowed are {', '.join(PX4_VERSIONS)}")
+        if options.signing_key is not None and options.px4 == "1.13":
+            raise VehicleError("PX4 1.13 does not sign messages: leave the key out, or be 1.18")
+        self.keyring = Keyring(options.signing_key, options.signing_time)
+        """The key of its links."""
         self.options = options
         self.system = 1 + options.instance
         file = options.vehicle
@@ -188,11 +197,16 @@ class Vehicle:
         self.slow = SlowTelemetry(file, self.autopilot, self.parameters, now=believed, rigid=rigid, seed=options.seed)
         self.telemetry.add(self.slow.builders)
         self.services = Services(
-            self.autopilot, self.parameters, self.telemetry, system=self.system, failures=self.faults
+            self.autopilot,
+            self.parameters,
+            self.telemetry,
+            system=self.system,
+            failures=self.faults,
+            keyring=self.keyring,
         )
         self.telemetry.add({ID_MISSION_CURRENT: self.services.mission_current})
-        self.companion = Link(self.system, ONBOARD_HZ, now_us)
-        self.ground = Link(self.system, GROUND_HZ, now_us, quiet=True)
+        self.companion = Link(self.system, ONBOARD_HZ, now_us, keyring=self.keyring, link_id=0)
+        self.ground = Link(self.system, GROUND_HZ, now_us, quiet=True, keyring=self.keyring, link_id=1)
         self.links = [self.companion, self.ground]
         self._texts = 0
         self._parameters_version = -1
@@ -215,6 +229,7 @@ class Vehicle:
     def finish_boot(self, passed_us: int) -> None:
         """Let the autopilot be there again, disarmed, passed_us after it went down; parameters and plans are kept."""
         plans, battery, was_quiet = self.autopilot.plans, self.slow.battery, self.ground.quiet
+        self.keyring.boot()
         self.booting = False
         self._boot_us = self.airframe.t_us - passed_us
         self._start_autopilot(in_air=False, plans=plans)

@@ -39,6 +39,7 @@ COMMANDS = {
     "stop": "End the flight: to rest on the path, then Hold.",
     "land": "End the flight and land.",
     "status": "Show how things stand on the vehicle, live.",
+    "key": "Make a key for signed messages, and give it to the autopilot.",
     "replay": "Give a flight's states to the controller again and compare its commands.",
 }
 """Every command with its line in `companion --help`; the module companion.cli.NAME holds it."""

@@ -21,6 +21,16 @@ if TYPE_CHECKING:
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="The flight's folder; default ./flights/<UTC>-<name>.")
 ]
+VehicleKeyOption = Annotated[
+    str | None,
+    typer.Option(
+        "--key", metavar="FILE", help="The key that messages of the vehicle link are signed with (`companion key new`)."
+    ),
+]
+VehicleSystemOption = Annotated[
+    int | None,
+    typer.Option("--system", metavar="ID", min=1, max=255, help="Listen to the autopilot of this system id alone."),
+]
 WindOption = Annotated[
     str | None,
     typer.Option("--wind", metavar="N,E,D", help="Velocity of the air in m/s, where it moves to; acts by the drag."),
@@ -162,17 +172,19 @@ def fly_bundled(
     timeout_s: float,
     quiet: bool,
     display: Display,
+    key: str | None = None,
 ) -> Flown:
-    """Starts the bundled vehicle, flies it, and ends it.
+    """Starts the bundled vehicle, flies it, and ends it; with a key both sign.
 
     Raises:
         InputError, LinkError: the vehicle does not start; it has said why.
     """
     from companion.flight.bundled import BundledVehicle
     from companion.flight.launch import control
+    from companion.link.vehicle_link import VehicleLink
 
     where = "on the ground" if flight.start is None else "in Hold"
-    with BundledVehicle(flight, folder, px4=px4, engine=engine, lockstep=lockstep, faults=faults) as bundled:
+    with BundledVehicle(flight, folder, px4=px4, engine=engine, lockstep=lockstep, faults=faults, key=key) as bundled:
         say(f"the bundled vehicle ({flight.vehicle.name}) waits {where}; flight folder {folder}", quiet=quiet)
 
         def listen(message: Mapping[str, Any]) -> None:
@@ -180,7 +192,7 @@ def fly_bundled(
             if "flown" in message:  # it would wait for a companion that has gone
                 bundled.stop()
 
-        return control(folder, bundled.connection, engine, timeout_s, listen)
+        return control(folder, VehicleLink(bundled.connection, key), engine, timeout_s, listen)
 
 
 def fault_file(name: str | None) -> Path | None:

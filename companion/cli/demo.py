@@ -20,6 +20,7 @@ from companion.cli.common import (
     TimeScaleOption,
     TrajectoryOption,
     TurbulenceOption,
+    VehicleKeyOption,
     VehicleOption,
     WindOption,
     adjustments,
@@ -54,6 +55,7 @@ def run(
     time_scale: TimeScaleOption = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of noise and gusts.")] = None,
     faults: FaultsOption = None,
+    key: VehicleKeyOption = None,
     real_time: Annotated[bool, typer.Option("--real-time", help="Fly at real time instead of in lockstep.")] = False,
     out: OutOption = None,
     engine: EngineOption = "auto",
@@ -68,6 +70,7 @@ def run(
     from companion.errors import InputError
     from companion.flight.bundled import PX4_VERSIONS, start_of
     from companion.flight.launch import prepare
+    from companion.link.vehicle_link import VehicleLink
     from companion.trajectory.load import embedded, of_flight
 
     resolve(engine)
@@ -83,6 +86,7 @@ def run(
     }
     configured = embedded(load_flight(flight, adjustments(**changes)), time_scale)
     start_of(configured)
+    VehicleLink(key=key).check()
     say_notes(of_flight(configured).notes, quiet=as_json)
     faults_path = fault_file(faults)
     version = px4 or ("1.13" if configured.output.sends == "actuators" else "1.18")
@@ -98,5 +102,6 @@ def run(
             timeout_s=CONNECT_TIMEOUT_S,
             quiet=as_json,
             display=display,
+            key=key,
         )
     raise typer.Exit(report_flight(flown, as_json=as_json))

@@ -17,7 +17,9 @@ import typer
 from companion.cli.common import (
     ControllerOption,
     JsonOption,
+    VehicleKeyOption,
     VehicleOption,
+    VehicleSystemOption,
     adjustments,
     controller_changes,
     say,
@@ -40,6 +42,8 @@ def run(
     connect: Annotated[
         str, typer.Option("--connect", help="udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.")
     ] = CONNECTION,
+    key: VehicleKeyOption = None,
+    system: VehicleSystemOption = None,
     flight: Annotated[
         str | None, typer.Option("--flight", metavar="NAME", help="Flight file; its trajectory is not looked at.")
     ] = None,
@@ -54,8 +58,7 @@ def run(
     from companion.flight.phases import PHASE_NAMES
     from companion.flight.preflight import gains_finding
     from companion.flight.tracker import kernels
-    from companion.link.transport import parse_connection
-    from companion.link.wire import Wire
+    from companion.link.vehicle_link import VehicleLink
     from companion.record.flight_record import FlightRecord
     from companion.trajectory.load import of_flight
 
@@ -63,13 +66,14 @@ def run(
         raise InputError("say which vehicle this is: --vehicle NAME (a vehicle file), or --flight NAME (a flight file)")
     if not (isfinite(timeout) and timeout > 0.0):
         raise InputError(f"--timeout {timeout:g}: must be a number of seconds above 0")
-    parse_connection(connect)
+    link = VehicleLink(connect, key, system)
+    link.check()
     configured = _configured(vehicle, flight, controller_changes(controller, output))
     by_law = configured.output.controller == "law"
     findings = [gains_finding(configured.vehicle)] if by_law else []
     say(f"{configured.vehicle.name}: listening on {connect}; message rates are asked for there", quiet=as_json)
     record, compiled = FlightRecord(0, PHASE_NAMES), kernels("python")
-    with Wire.open(connect) as wire:
+    with link.open() as wire:
         loop = FlightLoop(
             *(configured, of_flight(configured), wire, record, compiled),
             connect_timeout_s=timeout,

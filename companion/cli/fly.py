@@ -22,7 +22,9 @@ from companion.cli.common import (
     RerunFileOption,
     RerunOption,
     TimeScaleOption,
+    VehicleKeyOption,
     VehicleOption,
+    VehicleSystemOption,
     adjustments,
     controller_changes,
     fault_file,
@@ -49,6 +51,8 @@ def run(
             help="udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; default udpin:127.0.0.1:14540.",
         ),
     ] = None,
+    key: VehicleKeyOption = None,
+    system: VehicleSystemOption = None,
     sim: Annotated[bool, typer.Option("--sim", help="Start the bundled vehicle and fly that.")] = False,
     faults: FaultsOption = None,
     vehicle: VehicleOption = None,
@@ -73,7 +77,7 @@ def run(
     from companion.config import build_flight, find, load_flight
     from companion.errors import InputError
     from companion.flight.launch import control, prepare
-    from companion.link.transport import parse_connection
+    from companion.link.vehicle_link import VehicleLink
     from companion.trajectory.formats.reading import shown
     from companion.trajectory.load import embedded, of_flight
 
@@ -83,11 +87,14 @@ def run(
         raise InputError(f"--timeout {timeout:g}: must be a number of seconds above 0")
     if sim and connect is not None:
         raise InputError(f"--sim starts the bundled vehicle, --connect {connect} names another: leave one out")
+    if sim and system is not None:
+        raise InputError(f"--sim starts the bundled vehicle, --system {system} names another: leave one out")
     if faults is not None and not sim:
         raise InputError(f"--faults {faults}: only for the bundled vehicle; add --sim")
     resolve(engine)
     connection = connect or CONNECTION
-    parse_connection(connection)
+    link = VehicleLink(connection, key, system)
+    link.check()
     faults_path = fault_file(faults)
     name = shown(find(trajectory, "trajectories").stem)
     changes: dict[str, Any] = {
@@ -115,8 +122,9 @@ def run(
                 timeout_s=timeout,
                 quiet=as_json,
                 display=display,
+                key=key,
             )
         else:
             say(f"{configured.name}: {name} on {configured.vehicle.name}, listening on {connection}", quiet=as_json)
-            flown = control(folder, connection, engine, timeout, display)
+            flown = control(folder, link, engine, timeout, display)
     raise typer.Exit(report_flight(flown, as_json=as_json))

@@ -5,11 +5,13 @@ at once. This returns when the autopilot is landing.
 from __future__ import annotations
 
 from companion.cli.common import JsonOption
-from companion.cli.operate import TO_DEFAULT, TimeoutOption, ToOption, operate
+from companion.cli.operate import TO_DEFAULT, KeyOption, TimeoutOption, ToOption, operate
 
 EXAMPLE = "Example: companion land"
 
 
-def run(to: ToOption = TO_DEFAULT, timeout: TimeoutOption = 5.0, as_json: JsonOption = False) -> None:
+def run(
+    to: ToOption = TO_DEFAULT, key: KeyOption = None, timeout: TimeoutOption = 5.0, as_json: JsonOption = False
+) -> None:
     """Lands."""
-    operate(to, timeout, "land", lambda client: client.land(), as_json=as_json)
+    operate(to, key, timeout, "land", lambda client: client.land(), as_json=as_json)

@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 
 from companion.cli.common import JsonOption
-from companion.cli.operate import TO_DEFAULT, ToOption
+from companion.cli.operate import TO_DEFAULT, KeyOption, ToOption
 from companion.cli.upload import SystemOption
 
 EXAMPLE = "Example: companion list --to udpout:192.168.1.10:14590"
 
 
-def run(to: ToOption = TO_DEFAULT, system: SystemOption = None, as_json: JsonOption = False) -> None:
+def run(
+    to: ToOption = TO_DEFAULT, key: KeyOption = None, system: SystemOption = None, as_json: JsonOption = False
+) -> None:
     """Lists what is stored."""
     from companion.ground.upload import Files
 
-    with Files(to, system=system) as files:
+    with Files(to, system=system, key=key) as files:
         stored = files.list()
     if as_json:
         print(json.dumps([file._asdict() for file in stored], indent=2))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.common import JsonOption, say
+from companion.cli.common import JsonOption, VehicleKeyOption, VehicleSystemOption, say
 
 if TYPE_CHECKING:
     from companion.flight.phases import Autopilot
@@ -31,6 +31,8 @@ def run(
     connect: Annotated[
         str, typer.Option("--connect", help="udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.")
     ] = "udpin:127.0.0.1:14540",
+    key: VehicleKeyOption = None,
+    system: VehicleSystemOption = None,
     timeout: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for the vehicle.")] = 15.0,
     as_json: JsonOption = False,
 ) -> None:
@@ -40,14 +42,14 @@ def run(
     from companion.flight.phases import Autopilot, FlightEnded
     from companion.frames import GeoPoint
     from companion.link.mission_download import MissionType
-    from companion.link.wire import Wire
+    from companion.link.vehicle_link import VehicleLink
     from companion.trajectory.formats.wpl import text_of
 
     if not (isfinite(timeout) and timeout > 0.0):
         raise InputError(f"--timeout {timeout:g}: must be a number of seconds above 0")
     if file.exists():
         raise InputError(f"{file}: is there already; name another file")
-    with Wire.open(connect) as wire:
+    with VehicleLink(connect, key, system).open() as wire:
         try:
             system = find_autopilot(wire, connect, timeout, lambda: False)
         except FlightEnded as error:

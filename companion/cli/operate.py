@@ -24,10 +24,16 @@ ToOption = Annotated[
         " (udpin:0.0.0.0:14550, serial:DEVICE:BAUD).",
     ),
 ]
+KeyOption = Annotated[
+    str | None,
+    typer.Option("--key", metavar="FILE", help="The key of that link, where it is signed (`companion key new`)."),
+]
 TimeoutOption = Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for the companion.")]
 
 
-def operate(to: str, timeout_s: float, what: str, act: Callable[[Client], None], *, as_json: bool) -> None:
+def operate(
+    to: str, key: str | None, timeout_s: float, what: str, act: Callable[[Client], None], *, as_json: bool
+) -> None:
     """Connects, gives one command, and shows what the companion says meanwhile and how things stand then.
 
     Raises:
@@ -37,7 +43,7 @@ def operate(to: str, timeout_s: float, what: str, act: Callable[[Client], None],
 
     from companion.ground.client import Client
 
-    with Client(to, timeout_s) as client:
+    with Client(to, timeout_s, key) as client:
         try:
             act(client)
         finally:

@@ -14,7 +14,15 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.cli.common import ControllerOption, EngineOption, JsonOption, controller_changes, say
+from companion.cli.common import (
+    ControllerOption,
+    EngineOption,
+    JsonOption,
+    VehicleKeyOption,
+    VehicleSystemOption,
+    controller_changes,
+    say,
+)
 
 EXAMPLE = "Example: companion serve --vehicle px4_sih --connect udpin:127.0.0.1:14540"
 
@@ -31,6 +39,30 @@ def run(
         list[str] | None,
         typer.Option("--ground", metavar="CONNECTION", help=f"For ground tools (repeatable); default {GROUND}."),
     ] = None,
+    key: VehicleKeyOption = None,
+    ground_key: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ground-key",
+            metavar="FILE",
+            help="The key of a ground link: one for all of them, or one for each --ground in its order.",
+        ),
+    ] = None,
+    system: VehicleSystemOption = None,
+    ground_system: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--ground-system",
+            metavar="ID",
+            min=1,
+            max=255,
+            help="System id of a ground tool that may command and upload (repeatable); default 245, 254 and 255.",
+        ),
+    ] = None,
+    allow_unsigned: Annotated[
+        bool,
+        typer.Option("--allow-unsigned", help="Open ground links without a key to the network: anybody can fly."),
+    ] = False,
     folder: Annotated[
         Path, typer.Option("--folder", metavar="DIR", help="The trajectories that may be started.")
     ] = Path("trajectories"),
@@ -53,14 +85,19 @@ def run(
 ) -> None:
     """Waits for commands and flies, until it is stopped."""
     from companion.accelerate import resolve
-    from companion.ground.settings import Settings
+    from companion.ground.exposure import check_ground, ground_keys, open_vehicle_link
+    from companion.ground.settings import GROUND_SYSTEMS, Settings
     from companion.ground.supervisor import Supervisor
-    from companion.link.transport import parse_connection
+    from companion.link.vehicle_link import VehicleLink
 
     resolve(engine)
     links = tuple(ground or [GROUND])
-    for connection in (connect, *links):
-        parse_connection(connection)
+    link = VehicleLink(connect, key, system)
+    link.check()
+    keys = ground_keys(links, tuple(ground_key or ()))
+    check_ground(links, keys, allow_unsigned=allow_unsigned)
+    if warning := open_vehicle_link(link):
+        say(f"warning: {warning}", quiet=as_json)
     settings = Settings(
         connection=connect,
         ground=links,
@@ -68,6 +105,10 @@ def run(
         flights=str(_usable(flights, "--flights")),
         engine=engine,
         reports=reports,
+        key=None if key is None else str(Path(key).absolute()),
+        system=system,
+        ground_keys=keys,
+        ground_systems=tuple(ground_system or GROUND_SYSTEMS),
         flight=_flight(vehicle, flight, controller_changes(controller, output)),
     )
 

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from companion.cli.common import JsonOption
-from companion.cli.operate import TO_DEFAULT, TimeoutOption, ToOption
+from companion.cli.operate import TO_DEFAULT, KeyOption, TimeoutOption, ToOption
 
 if TYPE_CHECKING:
     from companion.ground.client import Client, Status
@@ -21,13 +21,15 @@ _TEXTS_SHOWN = 8
 _SILENT_S = 3.0
 
 
-def run(to: ToOption = TO_DEFAULT, timeout: TimeoutOption = 5.0, as_json: JsonOption = False) -> None:
+def run(
+    to: ToOption = TO_DEFAULT, key: KeyOption = None, timeout: TimeoutOption = 5.0, as_json: JsonOption = False
+) -> None:
     """Shows how things stand."""
     from rich.console import Console
 
     from companion.ground.client import Client
 
-    with Client(to, timeout) as client:
+    with Client(to, timeout, key) as client:
         status = client.status()
         if as_json:
             print(json.dumps(asdict(status), indent=2))
@@ -77,6 +79,7 @@ def _rows(client: Client, status: Status) -> list[tuple[str, str]]:
             "disturbance (N, E, D)",
             "-" if disturbance is None else ", ".join(f"{x:.3f}" for x in disturbance) + " m/s^2",
         ),
+        ("messages refused", "-" if status.refused_messages is None else str(status.refused_messages)),
     ]
 
 

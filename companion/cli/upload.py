@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.common import JsonOption, say
-from companion.cli.operate import TO_DEFAULT, ToOption
+from companion.cli.operate import TO_DEFAULT, KeyOption, ToOption
 
 if TYPE_CHECKING:
     from companion.ground.upload import Verdict
@@ -28,6 +28,7 @@ SystemOption = Annotated[
 def run(
     file: Annotated[str, typer.Argument(help="Trajectory file of any known format, or the name of a bundled one.")],
     to: ToOption = TO_DEFAULT,
+    key: KeyOption = None,
     name: Annotated[
         str | None,
         typer.Option("--name", metavar="NAME", help="What to call it there; default: its own name."),
@@ -49,7 +50,7 @@ def run(
     path = find(file, "trajectories")
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     with (
-        Files(to, system=system) as files,
+        Files(to, system=system, key=key) as files,
         Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar,
     ):
         task = bar.add_task("uploading", total=None)

@@ -51,13 +51,22 @@ class BundledVehicle:
         engine: of the physics.
         lockstep: the vehicle's clock waits for the companion; else real time.
         faults: file with what goes wrong; a copy goes into the folder.
+        key: file with the key that it signs with.
 
     Raises:
         InputError, LinkError: on entering, when the vehicle does not start; it has said why on stderr.
     """
 
     def __init__(
-        self, flight: Flight, folder: Path, *, px4: str, engine: str, lockstep: bool, faults: Path | None = None
+        self,
+        flight: Flight,
+        folder: Path,
+        *,
+        px4: str,
+        engine: str,
+        lockstep: bool,
+        faults: Path | None = None,
+        key: str | None = None,
     ) -> None:
         start = flight.start
         self._port = free_udp_port()
@@ -74,6 +83,7 @@ class BundledVehicle:
             *("--seed", str(flight.world.seed), "--truth", str(folder / TRUTH_FILE)),
             *("--port", "0", "--remote-port", str(self._port), "--no-ground", "--no-truth-stream"),
             *("--json-ready", "--with-parent", *(("--lockstep",) if lockstep else ())),
+            *(("--key", key) if key is not None else ()),
         ]
         if faults is not None:
             (folder / FAULTS_FILE).write_bytes(faults.read_bytes())

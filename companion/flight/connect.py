@@ -58,15 +58,14 @@ def find_autopilot(wire: Wire, connection: str, timeout_s: float, interrupted: C
             spoken_ns = wall_ns
             send_heartbeat(wire)
         for frame in wire.receive(WAIT_S):
-            system = autopilot_system(frame)
+            system = None if wire.only_system not in {None, frame.sysid} else autopilot_system(frame)
             if system is not None:
                 wire.system_id = system
                 send_heartbeat(wire)
                 return system
         if wall_ns - peer_since_ns > PEER_PATIENCE_NS:
             peer_since_ns = wall_ns
-            if wire.last_foreign is not None:
-                wire.peer, wire.last_foreign = wire.last_foreign, None
+            wire.try_another_peer()
 
 
 def autopilot_system(frame: Frame) -> int | None:
@@ -93,6 +92,12 @@ def _explain_silence(wire: Wire, connection: str, timeout_s: float) -> str:
     received = wire.counters.received
     seen = f"{received} MAVLink frames came, none of them an autopilot's heartbeat," if received else "nothing came"
     others = f"; {wire.last_foreign[0]}:{wire.last_foreign[1]} sends there as well" if wire.last_foreign else ""
+    refused = {reason.replace("_", " "): count for reason, count in wire.refusals.items() if count}
+    if refused and wire.signed:
+        told = ", ".join(f"{count} {reason}" for reason, count in refused.items())
+        others += f"; refused: {told} (has the autopilot this key? `companion key install`)"
+    if wire.only_system is not None:
+        others += f"; only system {wire.only_system} is listened to"
     return (
         f"{seen} at {connection} within {timeout_s:g} s{others}: check that the vehicle sends to this port (PX4 SITL:"
         " 14540; the bundled one: `sim-link run`), or name another with --connect"

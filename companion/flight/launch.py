@@ -22,6 +22,7 @@ from companion.config import Flight
 from companion.errors import CompanionError, ExitCode
 from companion.flight.preflight import gate_gains, gate_place, gate_reference
 from companion.flight.tracker import kernels
+from companion.link.vehicle_link import VehicleLink
 from companion.record.folder import create_flight_folder, write_configuration
 from companion.trajectory.load import of_flight, stored
 
@@ -85,12 +86,12 @@ def _identity(flight: Flight) -> str | None:
     return sha256(flight.model_dump_json().encode()).hexdigest()
 
 
-def control(folder: Path, connection: str, engine: str, timeout_s: float, listen: Listener) -> Flown:
+def control(folder: Path, link: VehicleLink | str, engine: str, timeout_s: float, listen: Listener) -> Flown:
     """Runs the control process and follows its status; SIGINT and SIGTERM are passed on to it.
 
     Args:
         folder: prepared by `prepare`.
-        connection: the vehicle link.
+        link: to the vehicle; a connection string stands for one without a key.
         engine: "auto", "python" or "numba".
         timeout_s: how long to wait for a vehicle.
         listen: gets every status message: {"line"}, {"progress"}, {"ready"}, {"flown"}, {"error"} or {"outcome"}. One
@@ -99,13 +100,14 @@ def control(folder: Path, connection: str, engine: str, timeout_s: float, listen
     Raises:
         CompanionError: the control process could not begin.
     """
+    link = VehicleLink(link) if isinstance(link, str) else link
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, _Relay() as relay:
         with theirs:
             process = subprocess.Popen(
                 [
                     *(sys.executable, "-m", "companion.flight.process"),
-                    *(str(folder), connection, engine, str(timeout_s), str(theirs.fileno())),
+                    *(str(folder), link.as_json(), engine, str(timeout_s), str(theirs.fileno())),
                 ],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,

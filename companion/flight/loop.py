@@ -370,6 +370,7 @@ class FlightLoop:
     def _on_frame(self, frame: Frame) -> None:
         msgid = frame.msgid
         if frame.sysid != self._ops.target_system or frame.compid != AUTOPILOT_COMPONENT:
+            self._wire.counters.other_system += 1
             self._host.on_frame(frame)
             return
         self._heard_ns = frame.arrival_wall_ns

@@ -206,6 +206,8 @@ class Outcome:
     """None: the controller never took over."""
     delay_s: dict[str, float | None] = field(default_factory=dict)
     """The delay from a state's stamp to the effect of its command: `flight.watch.Watch.delay_figures`."""
+    refused_messages: dict[str, int] = field(default_factory=dict)
+    """Messages that were not used because of who sent them, by reason."""
 
     def told(self) -> dict[str, Any]:
         """What a flight's log keeps of it: JSON types only."""
@@ -214,6 +216,7 @@ class Outcome:
             **{"rejected_states": self.rejected_states, "parameters": self.parameters},
             "phases": [list(change) for change in self.phases],
             "delay_s": self.delay_s,
+            "refused_messages": self.refused_messages,
         }
 
     @property

@@ -26,6 +26,8 @@ from companion.flight.loop import FlightLoop, Progress
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.preflight import BASELINE_PARAMETERS, gate_gains
 from companion.flight.tracker import Kernels, kernels
+from companion.link.framing import refused_since
+from companion.link.vehicle_link import VehicleLink
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, write_summary
@@ -165,16 +167,18 @@ class Ready:
         return _finish(self.folder, self.flight, self.trajectory, self.record, outcome, status)
 
 
-def fly(folder: Path, connection: str, engine: str, timeout_s: float, status: Status, signals: Signals) -> int:
+def fly(folder: Path, link: VehicleLink, engine: str, timeout_s: float, status: Status, signals: Signals) -> int:
     """Flies the flight of a folder and writes record and summary into it. Returns the exit code."""
     ready = Ready.made(folder, engine, status.line)
     outcome = None
+    connection = link.connection
     try:
-        with Wire.open(connection, tap=ready.recorder.offer) as wire:
+        with link.open(ready.recorder.offer) as wire:
             loop = ready.loop(wire, status, connection=connection, timeout_s=timeout_s)
             signals.hand_to(loop)
             status.send(ready=True)
             outcome = loop.run()
+            outcome.refused_messages = refused_since(wire.refusals, {})
             ready.note_outcome(outcome)
             status.send(flown=True)
     finally:
@@ -220,11 +224,11 @@ def _finish(folder: Path, flight: Any, trajectory: Any, record: FlightRecord, ou
 
 
 def main() -> int:
-    """Arguments: folder, connection, engine, connect timeout [s], file descriptor of the status channel."""
-    folder, connection, engine, timeout, descriptor = sys.argv[1:]
+    """Arguments: folder, vehicle link (JSON), engine, connect timeout [s], file descriptor of the status channel."""
+    folder, link, engine, timeout, descriptor = sys.argv[1:]
     status = Status(socket.socket(fileno=int(descriptor)))
     try:
-        return fly(Path(folder), connection, engine, float(timeout), status, Signals())
+        return fly(Path(folder), VehicleLink.from_json(link), engine, float(timeout), status, Signals())
     except CompanionError as error:
         status.send(error=str(error))
         return int(error.exit_code)

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Final
 
@@ -27,7 +28,7 @@ from companion.ground.messages import (
     decode_debug_vect,
     decode_named_value,
 )
-from companion.ground.reports import DISTURBANCE, ERROR, LYAPUNOV, TO_GO, TRACK_TIME
+from companion.ground.reports import DISTURBANCE, ERROR, LYAPUNOV, REFUSED, TO_GO, TRACK_TIME
 from companion.ground.standing import (
     ARMED_BIT,
     IDLE,
@@ -87,6 +88,8 @@ class Status:
     lyapunov: float | None = None
     disturbance_m_s2: Vec3 | None = None
     """As estimated, NED."""
+    refused_messages: int | None = None
+    """Messages that it has not used because of who sent them: not signed with its key, replayed, of other systems."""
 
     @property
     def flying(self) -> bool:
@@ -101,14 +104,15 @@ class Client:
         to: `udpout:HOST:PORT` of a ground link (default: this machine's), `udpin:0.0.0.0:14550` where the autopilot's
             radio arrives, or `serial:DEVICE:BAUD`.
         timeout_s: how long to wait for the companion.
+        key: file with the key of that link, where it is signed.
 
     Raises:
         InputError, LinkError: the connection cannot be opened, or no companion answers.
     """
 
-    def __init__(self, to: str = DEFAULT_CONNECTION, timeout_s: float = 5.0) -> None:
+    def __init__(self, to: str = DEFAULT_CONNECTION, timeout_s: float = 5.0, key: str | Path | None = None) -> None:
         self._to = to
-        self._wire = Wire.open(to, system_id=SYSTEM, component_id=COMPONENT)
+        self._wire = Wire.open(to, system_id=SYSTEM, component_id=COMPONENT, key=None if key is None else str(key))
         self._texts = StatusTexts()
         self._system: int | None = None
         self._code = 0
@@ -227,6 +231,7 @@ class Client:
             position_error_m=self._figure(ERROR),
             lyapunov=self._figure(LYAPUNOV),
             disturbance_m_s2=disturbance[1] if fresh and disturbance is not None else None,
+            refused_messages=None if (refused := self._figure(REFUSED)) is None else round(refused),
         )
 
     @property
@@ -272,12 +277,19 @@ class Client:
             if now_s - begun_s > timeout_s:
                 raise LinkError(
                     f"no companion answers at {self._to} within {timeout_s:g} s: is `companion serve` running there,"
-                    " with this ground link (--ground)?"
+                    f" with this ground link (--ground)?{self._refusal()}"
                 )
             if now_s - asked_s > REPEAT_S:
                 asked_s = now_s
                 self._ask_for_heartbeat()
             self.update(_WAIT_S)
+
+    def _refusal(self) -> str:
+        """Whether somebody answers whom we do not believe, or may not believe us."""
+        if not self._wire.signed:
+            return " Is the link signed (--key)?"
+        told = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in self._wire.refusals.items() if n)
+        return f" Refused here: {told}" if told else " Has it this key (--ground-key)?"
 
     def _ask_for_heartbeat(self) -> None:
         params = (float(codec.HEARTBEAT), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -40,9 +40,9 @@ from companion.ground.standby import Standby
 from companion.ground.standing import IDLE, PREPARING, Standing
 from companion.ground.undertakings import Undertakings
 from companion.link import codec, modes
-from companion.link.framing import Frame
+from companion.link.framing import Frame, refused_since
 from companion.link.operations import Operation
-from companion.link.wire import COMPANION_COMPONENT, Wire
+from companion.link.wire import COMPANION_COMPONENT
 from companion.record.recorder import Recorder
 
 STANDING_INTERVAL_NS: Final = 200_000_000
@@ -97,7 +97,7 @@ class Control:
             InputError, LinkError: the vehicle link cannot be had, or is gone.
         """
         self._warm_up()
-        with Wire.open(self._settings.connection, tap=self._tap) as wire:
+        with self._settings.link.open(self._tap) as wire:
             self._wire = wire
             self._standby = Standby(wire, self.on_frame, self._say)
             self._report.send(ready=True)
@@ -169,7 +169,9 @@ class Control:
             system=self._standby.system,
             host=self,
         )
+        refused_before = self._wire.refusals
         outcome = loop.run()
+        outcome.refused_messages = refused_since(self._wire.refusals, refused_before)
         ready.note_outcome(outcome)
         self._recorder = None
         self._loop = None
@@ -256,6 +258,7 @@ class Control:
             armed=autopilot.armed,
             phase=phase,
             paused=loop is not None and loop.paused,
+            refused=self._wire.refusals,
         )
         self._channel.note(standing=self._standing.as_note())
 

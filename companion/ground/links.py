@@ -11,8 +11,9 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.errors import LinkError
+from companion.link import codec
 from companion.link.codec import message_formats
-from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame
+from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame, refusals
 from companion.link.transport import Address, Transport, open_transport
 from companion.link.wire import COMPANION_COMPONENT
 
@@ -21,6 +22,7 @@ PEERS_MAX: Final = 16
 PEER_SILENCE_S: Final = 30.0
 """After which a tool at a `udpin` port gets no more reports."""
 _READS_MAX: Final = 64
+_GREET_S: Final = 0.2
 
 
 class Peer:
@@ -49,14 +51,26 @@ class GroundPort:
         connection: `udpin:127.0.0.1:14590`, `udpout:host:port` or `serial:/dev/ttyUSB0:57600`.
         system: asked for the system id that we send with.
         guard: verifies and signs.
+        systems: system ids of the tools that are listened to; None: all.
 
     Raises:
         InputError, LinkError: it cannot be opened.
     """
 
-    def __init__(self, connection: str, system: Callable[[], int], guard: FrameGuard | None = None) -> None:
+    def __init__(
+        self,
+        connection: str,
+        system: Callable[[], int],
+        guard: FrameGuard | None = None,
+        systems: frozenset[int] | None = None,
+    ) -> None:
         self.connection = connection
         self.counters = LinkCounters()
+        self.greeting: Callable[[], bytes] = codec.encode_heartbeat
+        """Makes the heartbeat that a tool gets whose signatures are right and late: it learns the time from that."""
+        self._systems = systems
+        self._outdated = 0
+        self._greeted_s = 0.0
         self._transport: Transport = open_transport(connection)
         self._system = system
         self._guard = guard
@@ -71,6 +85,11 @@ class GroundPort:
     def fileno(self) -> int:
         """File descriptor to wait on."""
         return self._transport.fileno()
+
+    @property
+    def refusals(self) -> dict[str, int]:
+        """What came and was not used because of who sent it, by reason."""
+        return refusals(self.counters, self._guard)
 
     @property
     def peers(self) -> list[Peer]:
@@ -101,10 +120,24 @@ class GroundPort:
         data = self._leftover + data
         done = self._parser.parse(data, time.monotonic_ns(), frames, [], final=not stream)
         self._leftover = data[done:] if stream else b""
+        if self._systems is not None and frames:
+            heard = len(frames)
+            frames = [frame for frame in frames if frame.sysid in self._systems]
+            self.counters.other_system += heard - len(frames)
         if not frames:
+            if self._guard is not None:
+                self._greet(self._guard, address)
             return []
         peer = self._peer(address if self._transport.fixed_peer is None else self._transport.fixed_peer)
         return [(frame, peer) for frame in frames]
+
+    def _greet(self, guard: FrameGuard, address: Address | None) -> None:
+        """Tells the time to a tool that has the key and is late, now and then; it becomes no peer by that."""
+        outdated, self._outdated = self._outdated, guard.outdated
+        now_s = time.monotonic()
+        if outdated != self._outdated and now_s - self._greeted_s > _GREET_S:
+            self._greeted_s = now_s
+            self.send_to(codec.HEARTBEAT, self.greeting(), address)
 
     def _peer(self, address: Address | None) -> Peer:
         peer = self._peers.get(address)

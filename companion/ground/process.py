@@ -21,6 +21,7 @@ from companion.ground.commands import CommandServer
 from companion.ground.hosting import Startable, file_server, open_store, parameter_server, tuned, tuning_of
 from companion.ground.links import GroundPort
 from companion.ground.messages import Severity, targets_of
+from companion.ground.refusals import Guards, RefusalWatch
 from companion.ground.report import Report
 from companion.ground.reports import Reports
 from companion.ground.service import GroundLink, Service
@@ -66,9 +67,17 @@ class Ground:
         self._channel = channel
         self._report = report
         self._standing = Standing()
-        self._ports = [GroundPort(connection, self._system) for connection in settings.ground]
+        self._systems = frozenset(settings.ground_systems)
+        self._guards = Guards()
+        self._ports = [
+            GroundPort(connection, self._system, self._guards.of(key), self._systems)
+            for connection, key in settings.ground_links
+        ]
         self._vehicle = VehicleLink(channel)
         self._reports = Reports(self._ports, self._vehicle, lambda: self._standing)
+        self._reports.refused = lambda: sum(sum(reasons.values()) for reasons in self._refusals().values())
+        for port in self._ports:
+            port.greeting = self._reports.heartbeat
         tuning = tuning_of(settings)
         store = open_store(tuned(settings, tuning.overrides))
         self._commands = CommandServer(self, Startable(store), self._reports, self._system)
@@ -76,7 +85,10 @@ class Ground:
         self._parameters = parameter_server(settings, tuning, self, self._say_verdict, self._system)
         self._services: list[Service] = [self._commands, self._files, self._parameters]
         self._faults: set[str] = set()
-        self._copies = FrameParser(message_formats(), LinkCounters())
+        # What the control process has verified is verified again: what was used on another link is no news here.
+        self._copied = LinkCounters()
+        self._copies = FrameParser(message_formats(), self._copied, self._guards.of(settings.key))
+        self._watch = RefusalWatch(self._report.line)
         self._stopping = False
 
     def request(self, number: int, what: str, **content: Any) -> bool:
@@ -113,6 +125,7 @@ class Ground:
         self._parameters.close()
         for port in self._ports:
             port.close()
+        self._guards.close()
         return int(ExitCode.DONE)
 
     def _tick(self, now_s: float) -> None:
@@ -121,6 +134,7 @@ class Ground:
         self._reports.tick(now_s)
         for port in self._ports:
             port.forget_silent(now_s)
+        self._watch.tick(now_s, self._refusals())
         if self._report.closed:
             self._stopping = True
 
@@ -129,8 +143,17 @@ class Ground:
         frames: list[Frame] = []
         self._copies.parse(item.raw, time.monotonic_ns(), frames, [])
         for frame in frames:
-            if frame.sysid != self._standing.system or frame.compid != 1:
+            if frame.sysid == self._standing.system and frame.compid == 1:
+                continue
+            if frame.sysid in self._systems:
                 self._dispatch(frame, self._vehicle, now_s)
+            else:
+                self._copied.other_system += 1
+
+    def _refusals(self) -> dict[str, dict[str, int]]:
+        """What was refused so far, by link and reason."""
+        radio = {**self._standing.refused, "through_the_radio": self._copied.other_system + self._copied.bad_signature}
+        return {"the vehicle link": radio, **{port.connection: port.refusals for port in self._ports}}
 
     def _dispatch(self, frame: Frame, link: GroundLink, now_s: float) -> None:
         targets = targets_of(frame.msgid, frame.payload)

@@ -35,6 +35,7 @@ TO_GO: Final = "time_to_go"
 LYAPUNOV: Final = "lyapunov"
 DISTURBANCE: Final = "disturb"
 TRACK_TIME: Final = "track_time"
+REFUSED: Final = "refused"
 
 
 class Reports:
@@ -50,6 +51,8 @@ class Reports:
         self._ports = ports
         self._vehicle = vehicle
         self._standing = standing
+        self.refused: Callable[[], int] = lambda: 0
+        """Asked for the messages of all links that were not used because of who sent them."""
         self._begun_s = time.monotonic()
         self._text = 0
         self._heartbeat_s = self._ground_s = self._radio_s = -1e9
@@ -65,7 +68,7 @@ class Reports:
     def send_message(self, msgid: int, link: GroundLink) -> bool:
         """HEARTBEAT and AUTOPILOT_VERSION are to be had."""
         if msgid == codec.HEARTBEAT:
-            link.send(codec.HEARTBEAT, self._heartbeat())
+            link.send(codec.HEARTBEAT, self.heartbeat())
         elif msgid == codec.AUTOPILOT_VERSION:
             link.send(codec.AUTOPILOT_VERSION, encode_autopilot_version(_version()))
         else:
@@ -76,7 +79,9 @@ class Reports:
         """Sends what is due."""
         if now_s - self._heartbeat_s >= HEARTBEAT_INTERVAL_S:
             self._heartbeat_s = now_s
-            self._everywhere(codec.HEARTBEAT, self._heartbeat())
+            self._everywhere(codec.HEARTBEAT, self.heartbeat())
+            since_ms = int((now_s - self._begun_s) * 1e3)
+            self._everywhere(NAMED_VALUE_FLOAT, encode_named_value(since_ms, REFUSED, float(self.refused())))
         if not self._standing().flying:
             return
         if now_s - self._ground_s >= GROUND_INTERVAL_S:
@@ -92,7 +97,8 @@ class Reports:
         """The heartbeat at once: something has changed."""
         self._heartbeat_s = -1e9
 
-    def _heartbeat(self) -> bytes:
+    def heartbeat(self) -> bytes:
+        """HEARTBEAT as it is now."""
         standing = self._standing()
         state = STATE_ACTIVE if standing.flying else STATE_STANDBY
         return codec.encode_heartbeat(custom_mode=standing.custom_code, system_status=state)

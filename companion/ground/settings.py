@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from itertools import zip_longest
+from typing import Any, Final
+
+from companion.link.vehicle_link import VehicleLink
+
+GROUND_SYSTEMS: Final = (245, 254, 255)
+"""Who may use the companion by default: MAVSDK, our own tools, QGroundControl and MAVProxy."""
 
 
 @dataclass(frozen=True)
@@ -12,7 +18,7 @@ class Settings:
     """The whole configuration of `companion serve`."""
 
     connection: str
-    """The vehicle link."""
+    """Of the vehicle link."""
     ground: tuple[str, ...]
     """The ground links."""
     trajectories: str
@@ -25,6 +31,24 @@ class Settings:
     """Whether a flight's report.html is built when the flight is over."""
     flight: dict[str, Any] = field(default_factory=dict)
     """Contents of a flight file but for name and trajectory: the vehicle as a table, output, take-off height, ..."""
+    key: str | None = None
+    """File with the key of the vehicle link."""
+    system: int | None = None
+    """System id of the only autopilot that is listened to; None: the first one that is heard."""
+    ground_keys: tuple[str | None, ...] = ()
+    """File with the key of each ground link; none where there are fewer."""
+    ground_systems: tuple[int, ...] = GROUND_SYSTEMS
+    """System ids of the ground tools that may use the companion, by a ground link or through the autopilot's radio."""
+
+    @property
+    def link(self) -> VehicleLink:
+        """The vehicle link."""
+        return VehicleLink(self.connection, self.key, self.system)
+
+    @property
+    def ground_links(self) -> tuple[tuple[str, str | None], ...]:
+        """Connection and key file of each ground link."""
+        return tuple(zip_longest(self.ground, self.ground_keys[: len(self.ground)]))
 
     def as_json(self) -> str:
         """For a command line."""
@@ -34,5 +58,6 @@ class Settings:
     def from_json(cls, text: str) -> Settings:
         """Reads `as_json` again."""
         content = json.loads(text)
-        content["ground"] = tuple(content["ground"])
+        for name in ("ground", "ground_keys", "ground_systems"):
+            content[name] = tuple(content[name])
         return cls(**content)

@@ -76,15 +76,14 @@ class Standby:
         if now_s - max(self._heard_s, self._peer_since_s) < PEER_PATIENCE_S:
             return
         self._peer_since_s = now_s
-        if self._wire.last_foreign is not None:
-            self._wire.peer, self._wire.last_foreign = self._wire.last_foreign, None
-        else:
+        if not self._wire.try_another_peer():
             self._wire.release_peer()
 
     def _on_frame(self, frame: Frame) -> None:
         if frame.msgid == codec.HEARTBEAT and frame.compid == AUTOPILOT_COMPONENT:
             self._meet(frame)
         if frame.sysid != self.system or frame.compid != AUTOPILOT_COMPONENT:
+            self._wire.counters.other_system += 1
             self._pass_on(frame)
             return
         if frame.msgid == codec.TIMESYNC:
@@ -99,7 +98,12 @@ class Standby:
         self._pass_on(frame)
 
     def _meet(self, frame: Frame) -> None:
-        """An autopilot's heartbeat: the first one, or another vehicle's, which only counts when ours has gone."""
+        """An autopilot's heartbeat: the first one, or another vehicle's, which only counts when ours has gone.
+
+        Where the vehicle is named, no other counts ever.
+        """
+        if self._wire.only_system not in {None, frame.sysid}:
+            return
         if frame.sysid == self.system:
             self.on_heartbeat(frame)
             return

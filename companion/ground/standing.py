@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from companion.control.types import Vec3
@@ -53,6 +53,8 @@ class Standing:
     steps: int = 0
     ended: str = ""
     """How the last flight ended."""
+    refused: dict[str, int] = field(default_factory=dict)
+    """Messages of the vehicle link that were not used because of who sent them, by reason, since the start."""
 
     @property
     def flying(self) -> bool:

@@ -75,6 +75,7 @@ class Files:
         connection: str | Connection = DEFAULT_CONNECTION,
         *,
         system: int | None = None,
+        key: str | None = None,
         patience_s: float = PATIENCE_S,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
@@ -85,6 +86,7 @@ class Files:
             connection: `udpout:HOST:PORT`, `udpin:HOST:PORT` or `serial:DEVICE:BAUD`, opened as system 254, component
                 190; or a link that is open already, which stays the caller's.
             system: the vehicle's system id; by default that of the only one that answers.
+            key: file with the key of that link, where it is signed.
             patience_s: how long nothing may come before the link counts as lost.
             clock: monotonic time [s].
             sleep: waits [s].
@@ -95,7 +97,7 @@ class Files:
         """
         self._own: Wire | None = None
         if isinstance(connection, str):
-            self._own = Wire.open(connection, system_id=OWN_SYSTEM, component_id=OWN_COMPONENT)
+            self._own = Wire.open(connection, system_id=OWN_SYSTEM, component_id=OWN_COMPONENT, key=key)
         link: Connection = self._own or connection  # type: ignore[assignment]
         self._clock = clock
         self._sleep = sleep

@@ -47,6 +47,14 @@ class Frame(NamedTuple):
 class FrameGuard(Protocol):
     """Message signing: THE place where frames are verified and signed."""
 
+    @property
+    def outdated(self) -> int:
+        """Frames so far whose signature was right and whose time was not."""
+
+    @property
+    def refusals(self) -> dict[str, int]:
+        """Frames that were refused, by reason."""
+
     def verify(self, raw: bytes, msgid: int, signed: bool) -> bool:
         """Whether this frame (its checksum is right) may be used."""
 
@@ -70,6 +78,8 @@ class LinkCounters:
     """Bytes that belong to no good frame."""
     foreign_address: int = 0
     """Datagrams from others than the peer."""
+    other_system: int = 0
+    """Frames of systems that have no say on this link."""
     unreachable: int = 0
     """Times the network said that what was sent cannot arrive: nobody listens there, no route, interface down."""
     sent: int = 0
@@ -78,6 +88,17 @@ class LinkCounters:
     lost: dict[tuple[int, int], int] = field(default_factory=dict)
     """Frames missing by their sequence numbers, per sender (system, component); every sender seen has an entry.
     A frame that comes late was counted as missing before."""
+
+
+def refusals(counters: LinkCounters, guard: FrameGuard | None) -> dict[str, int]:
+    """What came on a link and was not used because of who sent it, by reason."""
+    found = {"other_address": counters.foreign_address, "other_system": counters.other_system}
+    return found if guard is None else {**guard.refusals, **found}
+
+
+def refused_since(now: dict[str, int], before: dict[str, int]) -> dict[str, int]:
+    """What was refused meanwhile, without the reasons that there were none for."""
+    return {reason: count - before.get(reason, 0) for reason, count in now.items() if count > before.get(reason, 0)}
 
 
 def _length(data: bytes, at: int, end: int) -> int:

@@ -11,7 +11,7 @@ Nothing here touches files: `key_file` reads keys, `signing_times` keeps the tim
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from hashlib import sha256
 from hmac import compare_digest
 from typing import Final
@@ -88,10 +88,6 @@ class SigningCounters:
         """All that was refused."""
         return self.unsigned + self.wrong + self.replayed + self.stale + self.too_many
 
-    def as_dict(self) -> dict[str, int]:
-        """By name."""
-        return asdict(self)
-
 
 @dataclass
 class SigningTimes:
@@ -139,6 +135,17 @@ class Signer:
     def outdated(self) -> int:
         """Authentic frames that were refused for their time."""
         return self.counters.outdated
+
+    @property
+    def refusals(self) -> dict[str, int]:
+        """Frames that were refused, by reason."""
+        counters = self.counters
+        return {
+            "unsigned": counters.unsigned,
+            "wrong_signature": counters.wrong,
+            "replayed": counters.replayed,
+            "stale": counters.stale + counters.too_many,
+        }
 
     def now(self) -> int:
         """Signing time: the clock, or what others have told, whichever is later."""

@@ -2,7 +2,7 @@
 
 `receive` waits, drains and checks; `send` frames and never blocks. One link has one peer: PX4 locks on to the first
 sender and so do we, a second voice at the port is counted and not heard. Signing stands in front of everything, at
-one place (`framing.FrameGuard`).
+one place (`framing.FrameGuard`); with it, the peer is whoever sends the autopilot's first signed heartbeat.
 """
 
 from __future__ import annotations
@@ -13,20 +13,35 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Final
 
-from companion.link.codec import message_formats
-from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame
+from companion.link.codec import HEARTBEAT, encode_heartbeat, message_formats
+from companion.link.framing import (
+    MAGIC_V2,
+    SIGNED,
+    Frame,
+    FrameGuard,
+    FrameParser,
+    LinkCounters,
+    build_frame,
+    refusals,
+)
+from companion.link.signing import SETUP_SIGNING
+from companion.link.signing_times import KeptSigner, open_signer
 from companion.link.transport import Address, Transport, open_transport
 
 Tap = Callable[[int, bytes, int], object]
-"""Called with direction, raw frame and `time.monotonic_ns()` for every frame used or sent, and unknown ones."""
+"""Called with direction, raw frame and `time.monotonic_ns()` for every frame used or sent, and unknown ones; not for
+those that carry a key."""
 
 TAP_IN: Final = 0
 TAP_OUT: Final = 3  # the numbers that a traffic log (.tlog) has for the directions
 
 COMPANION_COMPONENT: Final = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+_AUTOPILOT_COMPONENT: Final = 1
 _READS_MAX = 256
 _DATAGRAM_MAX = 1400
 """Several frames in one datagram stay within what a network takes whole."""
+_UNHEARD_NS: Final = 1_000_000_000
+_GREET_NS: Final = 500_000_000
 
 
 class Wire:
@@ -39,7 +54,10 @@ class Wire:
         component_id: int = COMPANION_COMPONENT,
         tap: Tap | None = None,
         guard: FrameGuard | None = None,
+        only_system: int | None = None,
     ) -> None:
+        self.only_system = only_system
+        """System id of the only autopilot that is listened to; None: the first one that is heard."""
         self.system_id = system_id
         """Own system id in what is sent: the vehicle's, as soon as that is known."""
         self.component_id = component_id
@@ -58,6 +76,9 @@ class Wire:
         self._seq = 0
         self._leftover = b""
         self._gathered: list[bytes] | None = None
+        self._owned: KeptSigner | None = None
+        self._heard_ns = self._greeted_ns = 0
+        self._outdated = 0
         self._poll = select.poll()
         self._poll.register(transport.fileno(), select.POLLIN)
 
@@ -70,6 +91,8 @@ class Wire:
         component_id: int = COMPANION_COMPONENT,
         tap: Tap | None = None,
         guard: FrameGuard | None = None,
+        key: str | None = None,
+        only_system: int | None = None,
     ) -> Wire:
         """Open a link by its connection string.
 
@@ -80,12 +103,33 @@ class Wire:
             component_id: own component id.
             tap: sees every frame, for the traffic log; must not raise or block.
             guard: verifies and signs.
+            key: file with the key to verify and sign with, in the place of a guard.
+            only_system: system id of the only autopilot that is listened to.
 
         Raises:
-            InputError: the connection string, host or device name is wrong.
+            InputError: the connection string, host or device name is wrong, or the key file cannot be used.
             LinkError: the port or line cannot be had.
         """
-        return cls(open_transport(connection), system_id, component_id, tap, guard)
+        signer = open_signer(key)
+        try:
+            transport = open_transport(connection)
+        except BaseException:
+            if signer is not None:
+                signer.close()
+            raise
+        wire = cls(transport, system_id, component_id, tap, signer or guard, only_system)
+        wire._owned = signer
+        return wire
+
+    @property
+    def signed(self) -> bool:
+        """Whether frames are signed and verified."""
+        return self._guard is not None
+
+    @property
+    def refusals(self) -> dict[str, int]:
+        """What came and was not used because of who sent it, by reason."""
+        return refusals(self.counters, self._guard)
 
     def receive(self, timeout_s: float, spin_s: float = 0.0) -> list[Frame]:
         """Wait for the link at most this long, then return every good frame that is there, in the order of arrival.
@@ -145,27 +189,69 @@ class Wire:
     def _parse_datagram(
         self, data: bytes, address: Address | None, wall_ns: int, frames: list[Frame], unknown: list[bytes]
     ) -> None:
-        """Use a datagram of the peer; let the first valid frame decide who that is."""
-        if address == self.peer or self.peer is None:
-            before = len(frames)
-            self._parser.parse(data, wall_ns, frames, unknown)
-            if self.peer is None and len(frames) > before:
-                self.peer = address
-        else:
+        """Use a datagram of the peer; let the first valid frame, or the autopilot's, decide who that is."""
+        if self.peer is not None and address != self.peer:
             self.counters.foreign_address += 1
             self.last_foreign = address
+            return
+        before = len(frames)
+        self._parser.parse(data, wall_ns, frames, unknown)
+        if len(frames) > before:
+            self._heard_ns = wall_ns
+            if self.peer is None:
+                self._choose_peer(address, frames, before)
+        elif self._guard is not None:
+            self._greet(address, wall_ns)
+
+    def _choose_peer(self, address: Address | None, frames: list[Frame], before: int) -> None:
+        """Let what has come decide whom we talk to; what does not decide is not used."""
+        if self._guard is None or any(self._introduces(frame) for frame in frames[before:]):
+            self.peer = address
+        else:
+            self.counters.foreign_address += 1
+            del frames[before:]
+
+    def _introduces(self, frame: Frame) -> bool:
+        """Whether a frame says who is at the other end: for us the autopilot's signed heartbeat, for tools any."""
+        if frame.raw[0] != MAGIC_V2 or frame.raw[2] != SIGNED:
+            return False
+        if self.component_id != COMPANION_COMPONENT:
+            return True
+        autopilot = frame.msgid == HEARTBEAT and frame.compid == _AUTOPILOT_COMPONENT
+        return autopilot and self.only_system in {None, frame.sysid}
+
+    def _greet(self, address: Address | None, wall_ns: int) -> None:
+        """Tell the time to somebody who has the key and is late: PX4 begins in the past and learns it from us.
+
+        Otherwise both would wait for each other. In a flight there is nothing to learn any more.
+        """
+        assert self._guard is not None
+        outdated, self._outdated = self._outdated, self._guard.outdated
+        silent = wall_ns - self._heard_ns > _UNHEARD_NS and wall_ns - self._greeted_ns > _GREET_NS
+        if outdated == self._outdated or not silent or self.component_id != COMPANION_COMPONENT:
+            return
+        self._greeted_ns = wall_ns
+        before, self.peer = self.peer, address
+        self.send(HEARTBEAT, encode_heartbeat())
+        self.peer = before
 
     def _parse_stream(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> None:
         """Use what a line brought, keeping an unfinished frame for the next time."""
         data = self._leftover + data
+        before = len(frames)
         done = self._parser.parse(data, wall_ns, frames, unknown, final=False)
         self._leftover = data[done:]  # less than one frame
+        if len(frames) > before:
+            self._heard_ns = wall_ns
+        elif self._guard is not None:
+            self._greet(None, wall_ns)
 
     def _report(self, frames: list[Frame], unknown: list[bytes]) -> None:
         """Show the tap what came."""
         assert self._tap is not None
         for frame in frames:
-            self._tap(TAP_IN, frame.raw, frame.arrival_wall_ns)
+            if frame.msgid != SETUP_SIGNING:  # carries a key
+                self._tap(TAP_IN, frame.raw, frame.arrival_wall_ns)
         wall_ns = time.monotonic_ns()
         for raw in unknown:
             self._tap(TAP_IN, raw, wall_ns)
@@ -187,7 +273,7 @@ class Wire:
             return False
         self._seq = (self._seq + 1) & 0xFF
         self.counters.sent += 1
-        if self._tap is not None:
+        if self._tap is not None and msgid != SETUP_SIGNING:
             self._tap(TAP_OUT, raw, time.monotonic_ns())
         return True
 
@@ -226,6 +312,20 @@ class Wire:
         """Forget a peer that is not the vehicle: the next valid frame decides again. Not for use in flight."""
         self.peer = self._transport.fixed_peer
 
+    def try_another_peer(self) -> bool:
+        """Turn to the other sender at the port, if there is one and it need not prove who it is. Not for use in flight.
+
+        Returns:
+            Whether there was one. Where frames are signed, the peer is forgotten in its place.
+        """
+        if self._guard is not None:
+            self.release_peer()
+            return True
+        if self.last_foreign is None:
+            return False
+        self.peer, self.last_foreign = self.last_foreign, None
+        return True
+
     def fileno(self) -> int:
         """File descriptor, to wait on it together with others."""
         return self._transport.fileno()
@@ -233,6 +333,8 @@ class Wire:
     def close(self) -> None:
         """Close the link."""
         self._transport.close()
+        if self._owned is not None:
+            self._owned.close()
 
     def __enter__(self) -> Wire:
         return self

@@ -142,6 +142,7 @@ def note_end(
     if engagement is not None:
         summary["engagement"] = engagement
     summary["rejected_states"] = outcome["rejected_states"]
+    summary["refused_messages"] = outcome.get("refused_messages", {})
     if outcome.get("delay_s"):
         summary["delay_s"] = outcome["delay_s"]
     if summary["controller"] == "px4":

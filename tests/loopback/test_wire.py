@@ -9,6 +9,7 @@ import pty
 import socket
 import termios
 import time
+from typing import ClassVar
 
 import pytest
 
@@ -274,6 +275,9 @@ def test_sending_never_blocks():
 
 class ChecksumGuard:
     """A stand-in for signing."""
+
+    outdated = 0
+    refusals: ClassVar[dict[str, int]] = {}
 
     def sign(self, unsigned: bytes) -> bytes:
         return hashlib.sha256(unsigned).digest()[:13]

@@ -38,6 +38,7 @@ class VirtualWire:
 
     component_id = 191
     last_foreign = None
+    only_system = None
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
@@ -99,6 +100,9 @@ class VirtualWire:
             if not self.dead:
                 self.vehicle.receive(frame, self.vehicle.companion)
         return True
+
+    def try_another_peer(self) -> bool:
+        return False
 
     def release_peer(self) -> None:
         """There is only one."""
