@@ -231,7 +231,7 @@ class Client:
             position_error_m=self._figure(ERROR),
             lyapunov=self._figure(LYAPUNOV),
             disturbance_m_s2=disturbance[1] if fresh and disturbance is not None else None,
-            refused_messages=None if (refused := self._figure(REFUSED)) is None else round(refused),
+            refused_messages=round(self._figures[REFUSED][1]) if self._age_s(REFUSED) < FRESH_S else None,
         )
 
     @property

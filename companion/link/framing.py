@@ -78,6 +78,8 @@ class LinkCounters:
     """Bytes that belong to no good frame."""
     foreign_address: int = 0
     """Datagrams from others than the peer."""
+    early: int = 0
+    """Frames that came before the autopilot's signed heartbeat had said who the peer is."""
     other_system: int = 0
     """Frames of systems that have no say on this link."""
     unreachable: int = 0

@@ -208,7 +208,7 @@ class Wire:
         if self._guard is None or any(self._introduces(frame) for frame in frames[before:]):
             self.peer = address
         else:
-            self.counters.foreign_address += 1
+            self.counters.early += len(frames) - before
             del frames[before:]
 
     def _introduces(self, frame: Frame) -> bool:

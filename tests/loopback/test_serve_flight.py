@@ -107,7 +107,7 @@ def test_plain_pymavlink(both: tuple[Serving, Stand], whole: bool) -> None:
         kinds = {m.get_type() for m in tool.heard}
         assert {"HEARTBEAT", "NAMED_VALUE_FLOAT", "DEBUG_VECT"} <= kinds
         names = {m.name for m in tool.heard if m.get_type() in {"NAMED_VALUE_FLOAT", "DEBUG_VECT"}}
-        assert names == {"pos_error", "lyapunov", "time_to_go", "track_time", "disturb"}
+        assert names == {"pos_error", "lyapunov", "time_to_go", "track_time", "disturb", "refused"}
         assert {(m.get_srcSystem(), m.get_srcComponent()) for m in tool.heard} == {(1, 191)}
         assert tool.command(STOP, whole=whole)[-1] == ACCEPTED
         assert stand.mode is Mode.HOLD
