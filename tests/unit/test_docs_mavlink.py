@@ -26,7 +26,8 @@ def test_phases() -> None:
 
 def test_names_of_values() -> None:
     named = set(re.findall(r"(?:NAMED_VALUE_FLOAT|DEBUG_VECT) \| `(\w+)`", TEXT))
-    assert named == {reports.ERROR, reports.LYAPUNOV, reports.TRACK_TIME, reports.TO_GO, reports.DISTURBANCE}
+    told = {reports.ERROR, reports.LYAPUNOV, reports.TRACK_TIME, reports.TO_GO, reports.DISTURBANCE, reports.REFUSED}
+    assert named == told
     assert all(len(name) <= 10 for name in named)
 
 
