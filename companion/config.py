@@ -8,12 +8,13 @@ names the line.
 
 from __future__ import annotations
 
+import datetime
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from companion.control import heading
 from companion.control.law import Gains, Limits, Model, Parameters
@@ -106,7 +107,10 @@ class Controller(Section):
     heading_damping_1_s: Positive = 2.0
     heading_speed_min_m_s: Positive = 0.3
     disturbance_start: Literal["hover", "zero"] = "hover"
-    rate_lag_inversion: bool = True
+    # The known dynamics, each to be switched off by itself (docs/tracking.md shows what each brings).
+    drag_feedforward: bool = True
+    rate_lag_inversion: bool | tuple[bool, bool, bool] = True
+    """One for all axes, or roll, pitch and yaw."""
     thrust_lag_compensation: bool = True
     prediction: bool = True
     measured_delay: bool = True
@@ -154,11 +158,54 @@ class FlightLimits(Section):
         return self
 
 
+class Calibration(Section):
+    """[calibration]: where a vehicle file's numbers come from; `companion calibrate` writes it. Only the date is used.
+
+    Delays are from a setpoint's sending to its effect, residuals root mean squares of what the fitted model leaves.
+    """
+
+    date: str
+    """Of the flight, YYYY-MM-DD."""
+    autopilot: str = ""
+    """Its version."""
+    flight: str = ""
+    """The flight's folder."""
+    battery_v: Positive | None = None
+    battery_share: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] | None = None
+    mass_relative_error: NotNegative | None = None
+    """How well the mass is known."""
+    hover_thrust: Positive | None = None
+    """Command that hovers, of full, by the fit to all that was flown in offboard."""
+    hover_thrust_hold: Positive | None = None
+    """The same as the autopilot's own Hold needed it."""
+    rate_delay_s: Vector | None = None
+    """Of roll, pitch and yaw rate, each fitted with a delay of its own."""
+    rate_lag_own_s: Vector | None = None
+    """The time constants that go with those."""
+    thrust_delay_s: Finite | None = None
+    rate_residual_rad_s: NotNegativeVector | None = None
+    velocity_residual_m_s: NotNegative | None = None
+
+    @field_validator("date")
+    @classmethod
+    def _is_a_date(cls, text: str) -> str:
+        try:
+            datetime.date.fromisoformat(text)
+        except ValueError:
+            raise ValueError("must be a date, YYYY-MM-DD") from None
+        return text
+
+    def days_old(self, today: datetime.date) -> int:
+        """Days since."""
+        return (today - datetime.date.fromisoformat(self.date)).days
+
+
 class Vehicle(Section):
     """A vehicle file (config/vehicles/*.toml)."""
 
     name: str
     simulated: bool = False
+    """Whether it is a simulator: it needs no calibration."""
     body: Body
     rotors: Rotors
     autopilot: Autopilot
@@ -166,6 +213,7 @@ class Vehicle(Section):
     noise: Noise | None = None
     controller: Controller
     limits: FlightLimits
+    calibration: Calibration | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Vehicle:
@@ -214,10 +262,12 @@ class Vehicle(Section):
             c.heading_l2_1_s,
             c.heading_damping_1_s,
         )
-        rate_lag: Vec3 = self.autopilot.rate_lag_s if c.rate_lag_inversion else (0.0, 0.0, 0.0)
-        integral: Vec3 = self.autopilot.rate_integral_1_s if c.rate_lag_inversion else (0.0, 0.0, 0.0)
+        inverts = c.rate_lag_inversion
+        on = (inverts, inverts, inverts) if isinstance(inverts, bool) else inverts
+        rate_lag, integral = _where(on, self.autopilot.rate_lag_s), _where(on, self.autopilot.rate_integral_1_s)
         thrust_lag = self.rotors.lag_s if c.thrust_lag_compensation else 0.0
-        model = Model(self.body.mass_kg, GRAVITY_M_S2, self.body.drag_1_s, rate_lag, integral, thrust_lag)
+        drag = self.body.drag_1_s if c.drag_feedforward else 0.0
+        model = Model(self.body.mass_kg, GRAVITY_M_S2, drag, rate_lag, integral, thrust_lag)
         limits = Limits(
             lim.thrust_min_n,
             lim.thrust_max_n,
@@ -227,6 +277,11 @@ class Vehicle(Section):
             c.heading_speed_min_m_s,
         )
         return Parameters(gains, model, limits)
+
+
+def _where(on: tuple[bool, bool, bool], values: Vec3) -> Vec3:
+    """The values of the axes that are switched on, 0 for the others."""
+    return (values[0] if on[0] else 0.0, values[1] if on[1] else 0.0, values[2] if on[2] else 0.0)
 
 
 class Start(Section):
@@ -249,8 +304,9 @@ class SimulatedWorld(Section):
 class Output(Section):
     """[output]: who follows the reference, and which setpoints go to the autopilot."""
 
-    controller: Literal["law", "px4"] = "law"
-    """"px4": the reference itself is sent and PX4's own position controller follows it; then `kind` means nothing."""
+    controller: Literal["law", "px4", "calibration"] = "law"
+    """"px4": the reference itself is sent and PX4's own position controller follows it; then `kind` means nothing.
+    "calibration": a cautious hover and the manoeuvres of [calibration]; `companion calibrate` flies it."""
     kind: Literal["rates", "attitude", "actuators"] = "rates"
     """What the law sends."""
 
@@ -258,6 +314,22 @@ class Output(Section):
     def sends(self) -> Literal["rates", "attitude", "actuators", "position"]:
         """The setpoints that go to the autopilot."""
         return "position" if self.controller == "px4" else self.kind
+
+
+class CalibrationFlight(Section):
+    """[calibration] of a flight file: the manoeuvres by which a vehicle is identified (docs/calibration.md)."""
+
+    hold_s: Annotated[float, Field(ge=2.0, le=60.0, allow_inf_nan=False)] = 6.0
+    """For how long the autopilot's own Hold is watched before."""
+    rate_step_rad_s: Annotated[float, Field(ge=0.1, le=2.0, allow_inf_nan=False)] = 0.8
+    """Of roll and pitch; yaw gets a third of it."""
+    thrust_step: Annotated[float, Field(ge=0.05, le=0.5, allow_inf_nan=False)] = 0.3
+    """Share of the hover thrust."""
+    run_speed_m_s: Annotated[float, Field(ge=0.5, le=6.0, allow_inf_nan=False)] = 2.5
+    """Largest of the runs, to the north and to the east."""
+    run_length_m: Annotated[float, Field(ge=1.0, le=20.0, allow_inf_nan=False)] = 5.0
+    """From end to end of a run."""
+    repeats: Annotated[int, Field(ge=1, le=5)] = 2
 
 
 class Acceptance(Section):
@@ -290,6 +362,13 @@ class Flight(Section):
     height_min_m: Finite = 0.5
     """Lowest height above home that a trajectory may ask for; below zero where the ground falls off."""
     after: Literal["hold", "land"] = "hold"
+    calibration: CalibrationFlight | None = None
+
+    @model_validator(mode="after")
+    def _calibration_goes_with_its_controller(self) -> Flight:
+        if (self.output.controller == "calibration") is not (self.calibration is not None):
+            raise ValueError('output.controller = "calibration" and the table [calibration] go together')
+        return self
 
 
 def bundled_root() -> Path:

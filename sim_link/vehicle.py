@@ -33,6 +33,7 @@ from .messages import Telemetry, truth_payload
 from .messages_slow import SlowTelemetry
 from .missions import Plans
 from .offboard import Order
+from .parameter_set import DEFAULTS
 from .parameters import Parameters
 from .rotation import Vec3
 from .services import Services
@@ -146,7 +147,7 @@ class Vehicle:
         self.system = 1 + options.instance
         file = options.vehicle
         self.steps_per_tick = _steps_per_tick(file)
-        from_file = _from_vehicle_file(file, self.system)
+        from_file = _from_vehicle_file(file, self.system, options.px4)
         self._untouched = Parameters(options.px4, from_file)
         self.parameters = Parameters(options.px4, from_file | dict(options.parameters))
         self.airframe = Airframe(
@@ -422,7 +423,7 @@ def _steps_per_tick(file: VehicleFile) -> int:
     return whole
 
 
-def _from_vehicle_file(file: VehicleFile, system: int) -> dict[str, int | float]:
+def _from_vehicle_file(file: VehicleFile, system: int, px4: str) -> dict[str, int | float]:
     """Give the parameters that whoever set this vehicle up would have set."""
     return {
         "MAV_SYS_ID": system,
@@ -432,6 +433,11 @@ def _from_vehicle_file(file: VehicleFile, system: int) -> dict[str, int | float]
         "MC_ROLL_P": file.attitude_gain_1_s[0],
         "MC_PITCH_P": file.attitude_gain_1_s[1],
         "MC_YAW_P": file.attitude_gain_1_s[2],
+        **{
+            f"MC_{axis}RATE_I": ratio * float(DEFAULTS[f"MC_{axis}RATE_P"])
+            for axis, ratio in zip(("ROLL", "PITCH", "YAW"), file.rate_integral_1_s, strict=True)
+        },
+        **({"MC_REF_W_N": 2.0 / file.attitude_lag_s} if px4 != "1.13" and file.attitude_lag_s > 0.0 else {}),
         **{f"CA_ROTOR{k}_PX": x for k, x in enumerate(file.rotor_x_m)},
         **{f"CA_ROTOR{k}_PY": y for k, y in enumerate(file.rotor_y_m)},
         **{f"CA_ROTOR{k}_KM": m for k, m in enumerate(file.rotor_yaw_m)},

@@ -25,6 +25,7 @@ COMMANDS = {
     "check": "Check that trajectories can be flown: continuity, limits, margins.",
     "mission": "Download the autopilot's mission and geofence into a file to plan through.",
     "doctor": "Look at a connected vehicle: would a flight be refused, and why.",
+    "calibrate": "Find out what a vehicle is like, by flying it, and write its vehicle file.",
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
     "campaign": "Fly thousands of simulated flights of a study, or one of them again.",

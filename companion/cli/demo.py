@@ -82,6 +82,7 @@ def run(
         **controller_changes(controller, output),
         **wind_changes(wind, turbulence),
         "vehicle__link__state_age_s": state_age,
+        "vehicle__simulated": True,
         "world__seed": seed,
     }
     configured = embedded(load_flight(flight, adjustments(**changes)), time_scale)

@@ -1,5 +1,6 @@
 """The vehicle must be there: this waits for its heartbeat, checks its gates, takes off if it stands on the ground, and
 flies. With --sim it starts the bundled vehicle itself, in lockstep, on the ground or at the flight file's [start].
+A vehicle whose file has no [calibration] is refused (`companion calibrate`), unless it is a simulator.
 
 Without --flight the vehicle file says everything: gains, limits, rates + thrust as output, Hold at the end.
 """
@@ -54,6 +55,9 @@ def run(
     key: VehicleKeyOption = None,
     system: VehicleSystemOption = None,
     sim: Annotated[bool, typer.Option("--sim", help="Start the bundled vehicle and fly that.")] = False,
+    simulator: Annotated[
+        bool, typer.Option("--simulator", help="The vehicle is a simulator: it needs no calibration.")
+    ] = False,
     faults: FaultsOption = None,
     vehicle: VehicleOption = None,
     flight: Annotated[
@@ -100,6 +104,7 @@ def run(
     changes: dict[str, Any] = {
         **trajectory_changes(trajectory, frame),
         "after": "land" if land else None,
+        "vehicle__simulated": True if sim or simulator else None,
         **controller_changes(controller, output),
     }
     if flight is None:

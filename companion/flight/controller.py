@@ -1,12 +1,15 @@
-"""Who follows the reference: the law, or PX4's own position controller. A flight chooses one of them on the ground."""
+"""Who flies: the law, PX4's own position controller, or a calibration. A flight chooses one of them on the ground."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from companion.config import Flight
 from companion.control.types import State
 from companion.flight.baseline import Px4Baseline
+from companion.flight.calibration import Calibrator
+from companion.flight.phases import Autopilot
 from companion.flight.resets import Reset
 from companion.flight.tracker import Kernels, ReferenceAt, Tracker, TrackerStep
 
@@ -44,8 +47,26 @@ class Controller(Protocol):
         ...
 
 
-def controller_of(flight: Flight, compiled: Kernels) -> Controller:
-    """The controller that a flight asks for ([output] controller)."""
+def _silent(line: str) -> None:
+    """Tells nobody."""
+
+
+def controller_of(
+    flight: Flight,
+    compiled: Kernels,
+    autopilot: Autopilot | None = None,
+    notify: Callable[[str], None] = _silent,
+) -> Controller:
+    """The controller that a flight asks for ([output] controller).
+
+    Args:
+        flight: the configuration.
+        compiled: the law's arithmetic.
+        autopilot: what it says of itself, kept up to date.
+        notify: gets lines for people.
+    """
+    if flight.output.controller == "calibration":
+        return Calibrator(flight, Autopilot() if autopilot is None else autopilot, notify)
     if flight.output.controller == "px4":
         return Px4Baseline(flight.vehicle)
     return Tracker(flight.vehicle, flight.output.kind, compiled)

@@ -17,6 +17,7 @@ class Gate(StrEnum):
     """The gates, in the order in which they are told; the first needs no vehicle."""
 
     GAINS = "gains"
+    CALIBRATION = "calibration"
     PARAMETERS = "parameters"
     VERSION = "version"
     OUTPUT = "output"

@@ -116,6 +116,7 @@ def arming(m: Measured) -> Finding:
 
 
 GATES: Final[dict[Gate, Callable[[Measured], Finding]]] = {
+    Gate.CALIBRATION: setup.calibration,
     Gate.PARAMETERS: setup.parameters,
     Gate.VERSION: setup.version,
     Gate.OUTPUT: setup.output,

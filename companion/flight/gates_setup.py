@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from datetime import UTC, date, datetime
 from math import degrees, isfinite
 from typing import Final
 
+from companion.config import Flight
 from companion.control.types import GRAVITY_M_S2
 from companion.flight.findings import Finding, Gate, Measured, passed, refused, warning
 from companion.flight.silence import when_silent
@@ -27,8 +29,39 @@ OVERRIDE_IN_OFFBOARD: Final = 2
 """Bit of COM_RC_OVERRIDE, before PX4 1.18."""
 EXCEPT_OFFBOARD: Final = 4
 """Bit of COM_DLL_EXCEPT."""
+CALIBRATION_DAYS: Final = 180
+"""Older, propellers and batteries have aged with it."""
 STICKS_DISABLED: Final = 4.0
 """COM_RC_IN_MODE."""
+
+
+def calibrated(flight: Flight, today: date) -> Finding:
+    """The law flies with numbers that were found on this vehicle, or on a simulator."""
+    gate, limit = Gate.CALIBRATION, "[calibration] in the vehicle file, or a simulator"
+    vehicle = flight.vehicle
+    record = vehicle.calibration
+    if flight.output.controller != "law":
+        return passed(gate, "not needed", limit, "nothing that flies needs the vehicle file's model")
+    if record is None and vehicle.simulated:
+        return passed(gate, "a simulator", limit, "the vehicle file says that this is a simulator")
+    if record is None:
+        sentence = f"vehicle {vehicle.name!r} was never calibrated: its file has no [calibration]"
+        fix = "fly `companion calibrate`, or say that this is a simulator: simulated = true, or --simulator"
+        return refused(gate, "none", limit, sentence, fix)
+    days = record.days_old(today)
+    if days < -1:
+        sentence = f"the calibration is of {record.date}, which has not come yet"
+        return warning(gate, record.date, limit, sentence, "set this machine's clock, or look at the file")
+    if days > CALIBRATION_DAYS:
+        return warning(
+            gate, record.date, limit, f"the calibration is {days} days old", "fly `companion calibrate` again"
+        )
+    return passed(gate, record.date, limit, f"the vehicle was calibrated on {record.date}")
+
+
+def calibration(m: Measured) -> Finding:
+    """The same, today."""
+    return calibrated(m.flight, datetime.now(UTC).date())
 
 
 def parameters(m: Measured) -> Finding:
@@ -197,6 +230,8 @@ def thrust_curve(m: Measured) -> Finding:
     ours = m.flight.vehicle.rotors.curve_factor
     shown = "THR_MDL_FAC " + ("unknown" if factor is None else f"{factor:g}")
     limit = "in one place"
+    if m.flight.calibration is not None:
+        return passed(gate, shown, limit, "the thrust curve is what the calibration finds")
     if factor is not None and factor > 0.0 and ours > 0.0:
         sentence = f"THR_MDL_FAC is {factor:g} and rotors.curve_factor is {ours:g}: the thrust curve is undone twice"
         return refused(gate, shown, limit, sentence, "set rotors.curve_factor to 0, PX4 makes the thrust linear")
@@ -222,6 +257,8 @@ def hover_thrust(m: Measured) -> Finding:
     if theirs is None or not isfinite(theirs):
         return passed(gate, "MPC_THR_HOVER unknown", limit, "PX4's own hover thrust is not known")
     shown = f"MPC_THR_HOVER {theirs:.2f}"
+    if m.flight.calibration is not None:
+        return passed(gate, shown, "-", "the thrust of a hover is what the calibration finds")
     if abs(theirs - ours) > HOVER_TOLERANCE * ours:
         sentence = f"PX4 hovers with a thrust of {theirs:.2f}, by the vehicle file it is {ours:.2f}"
         return warning(gate, shown, limit, sentence, "one of them is wrong: check body.mass_kg and rotors.thrust_max_n")

@@ -25,6 +25,8 @@ TEST_RATIO_MAX: Final = 1.0
 TEST_RATIO_WANTED: Final = 0.5
 ACCURACY_MAX_M: Final = 5.0
 """COM_POS_FS_EPH where it is not known."""
+CALIBRATION_DELAY_MAX_S: Final = 0.1
+"""For the hover of a calibration, which needs no model."""
 NO_STATES = "no usable ODOMETRY within 5 s"
 
 
@@ -54,6 +56,8 @@ def state_age(m: Measured) -> Finding:
     gate, age = Gate.STATE_AGE, m.link.age_s
     assumed = m.flight.vehicle.link.state_age_s
     most = assumed + DELAY_MARGIN_MIN_S + _paced_s(m)
+    if m.flight.calibration is not None:  # the file's figure is what is to be found
+        most = max(most, CALIBRATION_DELAY_MAX_S)
     limit = f"at most {most * 1e3:.0f} ms"
     if age is None:
         return _unmeasured(gate, limit)
@@ -117,6 +121,8 @@ def round_trip(m: Measured) -> Finding:
     """Commands arrive as soon as the loop was certified for: half of a round trip is theirs."""
     gate, link, delay_s = Gate.ROUND_TRIP, m.link, m.flight.vehicle.link.command_delay_s
     most = 2.0 * (delay_s + DELAY_MARGIN_MIN_S) + _paced_s(m)
+    if m.flight.calibration is not None:
+        most = max(most, CALIBRATION_DELAY_MAX_S)
     limit = f"at most {most * 1e3:.0f} ms"
     if link.round_trip_s is None:
         sentence = "the vehicle does not answer TIMESYNC: how long commands take is not known"

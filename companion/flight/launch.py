@@ -20,7 +20,7 @@ from typing import Any
 from companion.campaign.predict import gate_prediction
 from companion.config import Flight
 from companion.errors import CompanionError, ExitCode
-from companion.flight.preflight import gate_gains, gate_place, gate_reference
+from companion.flight.preflight import gate_calibration, gate_gains, gate_place, gate_reference
 from companion.flight.tracker import kernels
 from companion.link.vehicle_link import VehicleLink
 from companion.record.folder import create_flight_folder, write_configuration
@@ -52,6 +52,7 @@ def gate(flight: Flight) -> None:
     """
     trajectory = of_flight(flight)
     by_law = flight.output.controller == "law"  # the gains, and what is predicted with them, are the law's
+    gate_calibration(flight)
     if by_law:
         gate_gains(flight.vehicle, brief=True)
     gate_reference(trajectory, flight.vehicle)

@@ -22,6 +22,7 @@ from companion.control import flat
 from companion.control.output import Setpoint
 from companion.control.types import Quat, State, Vec3
 from companion.errors import LinkError
+from companion.flight.calibration import Calibrator
 from companion.flight.clock import VehicleClock
 from companion.flight.coast import coast_setpoint
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
@@ -33,7 +34,7 @@ from companion.flight.measure import silence_limit_s
 from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
 from companion.flight.prediction import Attitude
 from companion.flight.preflight import Preflight
-from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
+from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report, vehicle_facts
 from companion.flight.responses import respond
 from companion.flight.retuning import ParameterChange, Retuning
 from companion.flight.rows import StepTiming, control_row
@@ -163,7 +164,8 @@ class FlightLoop:
         self._host: Host = Alone() if host is None else host
         self._engaged = engaged
         self._only_gates = only_gates
-        self._tracker = controller_of(flight, compiled)
+        self._autopilot = Autopilot()
+        self._tracker = controller_of(flight, compiled, self._autopilot, notify)
         self._retuning = Retuning(self._tracker, notify) if isinstance(self._tracker, Tracker) else None
         self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
         self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
@@ -171,7 +173,6 @@ class FlightLoop:
         self._peer = PacedPeer()
         self._clock = VehicleClock(self._peer)
         self._clock.waits = True
-        self._autopilot = Autopilot()
         self._interrupted = False
         self._met = False
         """Whether an autopilot was heard: what depends on it exists from then on."""
@@ -260,7 +261,8 @@ class FlightLoop:
         self._keep_ramps()
         figures = self._watch.delay_figures() if self._engagement is not None else {}
         return Outcome(
-            *(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement, figures)
+            *(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement, figures),
+            vehicle=vehicle_facts(self._autopilot, self._ops.version),
         )
 
     def _fly(self) -> tuple[Cause, str]:
@@ -638,7 +640,8 @@ class FlightLoop:
         if self._coasted or state is None or self._sequence.duty is Duty.NOTHING:
             return
         self._coasted = True
-        self._send(coast_setpoint(self._flight, state.q), state)
+        hover = self._tracker.hover_share if isinstance(self._tracker, Calibrator) else None
+        self._send(coast_setpoint(self._flight, state.q, hover), state)
 
 
 __all__ = ["FlightLoop", "Progress"]

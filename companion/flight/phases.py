@@ -127,6 +127,12 @@ class Autopilot:
     """Share that is left in the first battery; None: unknown."""
     hold_thrust: float | None = None
     """Thrust setpoint while the autopilot itself held the vehicle, smoothed (0 to 1)."""
+    hold_thrusts: list[float] = field(default_factory=list)
+    """The same as they came while somebody gathers them; see `gathers`."""
+    gathers: bool = False
+    """Whether the thrust setpoints of the autopilot's own hover are kept."""
+    battery_v: float | None = None
+    """Voltage of the battery."""
     parameters: dict[str, float] = field(default_factory=dict)
     system_status: int | None = None
     """MAV_STATE, of HEARTBEAT; None before the first."""
@@ -208,6 +214,8 @@ class Outcome:
     """The delay from a state's stamp to the effect of its command: `flight.watch.Watch.delay_figures`."""
     refused_messages: dict[str, int] = field(default_factory=dict)
     """Messages that were not used because of who sent them, by reason."""
+    vehicle: dict[str, Any] = field(default_factory=dict)
+    """What the autopilot told of the vehicle: `flight.reports.vehicle_facts`."""
 
     def told(self) -> dict[str, Any]:
         """What a flight's log keeps of it: JSON types only."""
@@ -217,6 +225,7 @@ class Outcome:
             "phases": [list(change) for change in self.phases],
             "delay_s": self.delay_s,
             "refused_messages": self.refused_messages,
+            "vehicle_facts": self.vehicle,
         }
 
     @property

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 
 from companion.config import Flight, Vehicle
 from companion.control.certificate import certify, disturbance_overcome
@@ -17,7 +18,7 @@ from companion.errors import RefusedError
 from companion.flight import gates_state
 from companion.flight.findings import Finding, Gate, Measured, Verdict, passed, refusal, refused
 from companion.flight.gates import DOWN, judge
-from companion.flight.gates_setup import NEEDED
+from companion.flight.gates_setup import NEEDED, calibrated
 from companion.flight.health import ESTIMATOR_STATUS, SYS_STATUS
 from companion.flight.inspection import reference_problems
 from companion.flight.measure import LinkMeter, silence_limit_s
@@ -55,6 +56,11 @@ PARAMETERS = (
     *("MPC_THR_HOVER", "MPC_TILTMAX_AIR", "IMU_GYRO_CUTOFF", "IMU_DGYRO_CUTOFF", "EKF2_HGT_REF", "SYS_FAILURE_EN"),
 )
 """What a flight depends on; the log keeps them all. Those of `gates_setup.NEEDED` come first and are a must."""
+CALIBRATION_PARAMETERS = (
+    *("MC_ROLLRATE_P", "MC_ROLLRATE_I", "MC_PITCHRATE_P", "MC_PITCHRATE_I", "MC_YAWRATE_P", "MC_YAWRATE_I"),
+    *("MC_ROLL_P", "MC_PITCH_P", "MC_YAW_P"),
+)
+"""Beside those, where a vehicle is calibrated: what its file says of the loops. None is a must."""
 BASELINE_PARAMETERS = (
     *("MPC_XY_P", "MPC_Z_P", "MPC_XY_VEL_P_ACC", "MPC_XY_VEL_I_ACC", "MPC_XY_VEL_D_ACC"),
     *("MPC_Z_VEL_P_ACC", "MPC_Z_VEL_I_ACC", "MPC_Z_VEL_D_ACC", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP"),
@@ -63,6 +69,8 @@ BASELINE_PARAMETERS = (
 """Beside those, where PX4's own position controller flies: what its tracking goes by. For the summary; none is a
 must."""
 
+MORE_PARAMETERS = {"law": (), "px4": BASELINE_PARAMETERS, "calibration": CALIBRATION_PARAMETERS}
+
 CURRENT_MODE = 436
 EXTENDED_SYS_STATE = 245
 HOME_POSITION = 242
@@ -70,6 +78,8 @@ ATTITUDE_TARGET = 83
 
 MESSAGE_RATES_HZ = {CURRENT_MODE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 5.0, ESTIMATOR_STATUS: 5.0}
 """Beside ODOMETRY, which is asked for at the vehicle file's rate."""
+HOLD_THRUST_HZ = 20.0
+"""ATTITUDE_TARGET, where the thrust of the autopilot's own hover is measured."""
 RUN_PREARM_CHECKS = 401
 
 
@@ -124,6 +134,17 @@ def gate_gains(vehicle: Vehicle, *, allow_uncertified: bool = False, brief: bool
             f" {DELAY_MARGIN_MIN_S * 1e3:g} ms are required; {hint}"
         )
     return found
+
+
+def gate_calibration(flight: Flight) -> None:
+    """The vehicle was calibrated, or is a simulator.
+
+    Raises:
+        RefusedError: neither.
+    """
+    finding = calibrated(flight, datetime.now(UTC).date())
+    if finding.verdict is Verdict.REFUSED:
+        raise RefusedError(finding.told)
 
 
 def gains_finding(vehicle: Vehicle) -> Finding:
@@ -228,10 +249,12 @@ class Preflight:
         self._rate = ops.set_message_interval(codec.ODOMETRY, int(1e6 / rate * ASK_FASTER), now_s)
         for msgid, hz in MESSAGE_RATES_HZ.items():
             ops.set_message_interval(msgid, int(1e6 / hz), now_s)
+        if self._flight.calibration is not None:
+            ops.set_message_interval(ATTITUDE_TARGET, int(1e6 / HOLD_THRUST_HZ), now_s)
         self._version = ops.request_message(codec.AUTOPILOT_VERSION, now_s)
         ops.request_message(HOME_POSITION, now_s)
-        law = self._flight.output.controller == "law"
-        for name in dict.fromkeys(PARAMETERS if law else (*PARAMETERS, *BASELINE_PARAMETERS)):
+        more = MORE_PARAMETERS[self._flight.output.controller]
+        for name in dict.fromkeys((*PARAMETERS, *more)):
             retry = Retry() if name in NEEDED else OPTIONAL_RETRY
             self._reads[name] = ops.read_parameter(name, now_s, retry)
 

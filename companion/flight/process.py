@@ -110,8 +110,10 @@ class Ready:
         if flight.output.controller == "law":
             gate_gains(flight.vehicle, brief=True)
             line(f"engine: {compiled.engine}")
-        else:
+        elif flight.output.controller == "px4":
             line("controller: PX4's own, it gets the reference as setpoints")
+        else:
+            line("controller: a cautious hover, with the manoeuvres of a calibration")
         warm_up(flight, compiled)
         capacity = int((trajectory.duration_s + MARGIN_S) * flight.vehicle.link.state_rate_hz * 1.1)
         record = FlightRecord(capacity, PHASE_NAMES)

@@ -10,13 +10,23 @@ from companion.control.types import GRAVITY_M_S2, Quat
 from companion.control.vectors import axes
 from companion.flight.health import ESTIMATOR_STATUS, SYS_STATUS, EstimatorHealth, SystemHealth
 from companion.flight.phases import Autopilot, LandedState
-from companion.flight.preflight import ATTITUDE_TARGET, CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION
+from companion.flight.preflight import (
+    ATTITUDE_TARGET,
+    CALIBRATION_PARAMETERS,
+    CURRENT_MODE,
+    EXTENDED_SYS_STATE,
+    HOME_POSITION,
+)
 from companion.frames import GeoPoint
 from companion.link import codec
 from companion.link.framing import Frame
 from companion.link.modes import HOLD, Mode
+from companion.link.version import AutopilotVersion
 
 BATTERY_STATUS = 147
+VOLTAGE_UNKNOWN = 0xFFFF
+"""SYS_STATUS.voltage_battery."""
+LOOP_PARAMETERS = (*CALIBRATION_PARAMETERS, "MC_REF_W_N", "MPC_THR_HOVER", "THR_MDL_FAC")
 HOLD_THRUST_SHARE = 0.2
 """Of a new value in the smoothed thrust of the autopilot's hover."""
 HOLD_THRUST_TRUST = 0.25
@@ -52,6 +62,8 @@ def take_report(autopilot: Autopilot, frame: Frame) -> None:
         autopilot.landed = _LANDED_STATES.get(message.landed_state, LandedState.UNDEFINED)
     elif frame.msgid == SYS_STATUS:
         autopilot.health = SystemHealth.from_message(message)
+        if 0 < message.voltage_battery < VOLTAGE_UNKNOWN:
+            autopilot.battery_v = 1e-3 * message.voltage_battery
     elif frame.msgid == ESTIMATOR_STATUS:
         autopilot.estimator = EstimatorHealth.from_message(message)
     elif frame.msgid == BATTERY_STATUS:
@@ -61,10 +73,26 @@ def take_report(autopilot: Autopilot, frame: Frame) -> None:
         if autopilot.mode == HOLD and 0.0 < message.thrust < 1.0:
             before = message.thrust if autopilot.hold_thrust is None else autopilot.hold_thrust
             autopilot.hold_thrust = before + HOLD_THRUST_SHARE * (message.thrust - before)
+            if autopilot.gathers:
+                autopilot.hold_thrusts.append(message.thrust)
     elif all(math.isfinite(x) for x in (message.x, message.y, message.z)):
         autopilot.home = (message.x, message.y, message.z)
         autopilot.home_amsl_m = message.altitude * 1e-3
         autopilot.home_global = _place(message)
+
+
+def vehicle_facts(autopilot: Autopilot, version: AutopilotVersion | None) -> dict[str, Any]:
+    """What the autopilot told of the vehicle and a vehicle file may want to know; JSON types only."""
+    thrusts = autopilot.hold_thrusts
+    shares = (autopilot.battery, None if autopilot.health is None else autopilot.health.battery)
+    return {
+        "autopilot": None if version is None else version.label,
+        "battery_v": autopilot.battery_v,
+        "battery_share": next((share for share in shares if share is not None), None),
+        "hold_thrust": sum(thrusts) / len(thrusts) if thrusts else autopilot.hold_thrust,
+        "hold_thrust_samples": len(thrusts),
+        "parameters": {name: autopilot.parameters[name] for name in LOOP_PARAMETERS if name in autopilot.parameters},
+    }
 
 
 def _place(message: Any) -> GeoPoint | None:

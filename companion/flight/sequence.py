@@ -48,6 +48,8 @@ REFUSALS_MAX = 3
 """One refusal may be of the moment: PX4 judges a mode ten times per second."""
 INTENTION_WAIT_S = 0.3
 """What a change of mode was meant to be comes with CURRENT_MODE, at 10 Hz."""
+HOLD_CALM_S = 1.0
+"""The beginning of a Hold that is watched does not count."""
 FRESH_S = 0.5
 """An older state does not say where the vehicle is."""
 REASON_WAIT_S = 0.5
@@ -123,6 +125,7 @@ class Sequence:
         self._other_mode: Mode = modes.HOLD
         """A mode that this flight did not ask for, and since when."""
         self._meant: set[Mode] = set()
+        self._hold_since_s: float | None = None
         self.orders = Orders(self, autopilot, flight.vehicle.link.state_rate_hz)
         """What the operator wants."""
 
@@ -295,7 +298,8 @@ class Sequence:
         if autopilot.mode == modes.HOLD and autopilot.intended in {None, modes.HOLD}:
             known = autopilot.intended is not None or self._operation is not None
             if known and self._slower_than(START_SPEED_MAX_M_S, now_s):
-                self._plan_course(now_s)
+                if self._watched_hold(now_s):
+                    self._plan_course(now_s)
                 return
         if self._operation is None and (autopilot.mode, autopilot.intended) != (modes.HOLD, modes.HOLD):
             self._operation = self._ops.set_mode(modes.HOLD, now_s)
@@ -303,6 +307,23 @@ class Sequence:
             return
         if now_s - self._since_s > START_TIMEOUT_S:
             self.end(Cause.REFUSED, f"the vehicle does not hold still in Hold after {START_TIMEOUT_S:g} s", now_s)
+
+    def _watched_hold(self, now_s: float) -> bool:
+        """Whether the autopilot's own hover was watched for as long as a calibration asks for."""
+        plan, autopilot = self._flight.calibration, self._autopilot
+        if plan is None:
+            return True
+        if autopilot.home is None:
+            raise FlightEnded(Cause.REFUSED, "the home position is not known, and so not the height above ground")
+        if self._hold_since_s is None:
+            self._hold_since_s = now_s
+            self._notify(f"join: measuring the thrust of the autopilot's own hover for {plan.hold_s:g} s")
+        since_s = now_s - self._hold_since_s
+        autopilot.gathers = since_s >= HOLD_CALM_S
+        if since_s < HOLD_CALM_S + plan.hold_s:
+            return False
+        autopilot.gathers = False
+        return True
 
     def _plan_course(self, now_s: float) -> None:
         """Plans join and stop from where the vehicle is held, while the autopilot still has it."""

@@ -191,7 +191,8 @@ def test_autopilot_that_tells_nothing(tmp_path) -> None:
     with Stand(flight, tmp_path, alter=alter) as stand:
         found = look(stand)
         assert stand.vehicle.t_us - stand.vehicle.start_us < 6_000_000
-    assert found.against() == {Gate.ESTIMATOR, Gate.LANDED_STATE}
+    assert found.against() == {Gate.ESTIMATOR, Gate.LANDED_STATE, Gate.CALIBRATION}
+    assert "never calibrated" in found.by_gate[Gate.CALIBRATION].told
     unknown = {Gate.VERSION, Gate.PILOT, Gate.ROUND_TRIP, Gate.CLOCK, Gate.BATTERY, Gate.ESTIMATOR_TESTS}
     assert found.warned() >= unknown | {Gate.ESTIMATOR_ACCURACY}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -73,7 +74,19 @@ STICKS = {"sticks": True}
 OLD = AutopilotVersion((1, 12, 3), 255, 0, 0)
 NOT_FINITE = StateRejection.NOT_FINITE
 
+
+def calibrated_on(day: str) -> dict[str, Any]:
+    return REAL | {"vehicle__calibration": {"date": day}}
+
+
+TODAY = datetime.now(UTC).date()
 CASES: list[tuple[Gate, str, dict[str, Any], str]] = [
+    (Gate.CALIBRATION, "refused", dict(settings=REAL), "never calibrated: its file has no [calibration]; fly"),
+    (Gate.CALIBRATION, "passed", dict(), "a simulator"),
+    (Gate.CALIBRATION, "passed", dict(settings=REAL | {"output__controller": "px4"}), "nothing that flies needs"),
+    (Gate.CALIBRATION, "passed", dict(settings=calibrated_on(TODAY.isoformat())), f"calibrated on {TODAY}"),
+    (Gate.CALIBRATION, "warning", dict(settings=calibrated_on("2020-02-29")), "days old; fly `companion calibrate`"),
+    (Gate.CALIBRATION, "warning", dict(settings=calibrated_on("2999-01-01")), "has not come yet"),
     (Gate.PARAMETERS, "refused", dict(unread={"NAV_RCL_ACT": "reading NAV_RCL_ACT got no answer"}), "got no answer"),
     (Gate.VERSION, "warning", dict(version=OLD), "PX4 1.12.3 is older"),
     (Gate.VERSION, "warning", dict(version=None, settings=REAL), "does not tell its version"),
