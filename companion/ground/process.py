@@ -7,6 +7,7 @@ messages pass and decides about requests itself. If it is killed, the supervisor
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import signal
 import socket
@@ -35,6 +36,8 @@ WAIT_MS: Final = 10
 TICK_S: Final = 0.01
 DEFAULT_SYSTEM: Final = 1
 """Ours while no vehicle was heard."""
+_NICE: Final = 5
+"""The control process goes first where both want a core."""
 _ITEMS_MAX: Final = 64
 
 
@@ -212,6 +215,7 @@ def main() -> int:
     report = Report(socket.socket(fileno=int(report_fd)))
     channel = Channel(socket.socket(fileno=int(channel_fd)))
     channel.discard()
+    os.nice(_NICE)
     try:
         ground = Ground(Settings.from_json(settings), channel, report)
         for number in (signal.SIGTERM, signal.SIGHUP):

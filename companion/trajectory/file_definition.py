@@ -17,6 +17,7 @@ from companion.trajectory.formats.contents import Leg, Route
 from companion.trajectory.waypoints import HeadingMode, PlanLimits, Waypoint, plan_limits
 
 WAYPOINTS_MAX = 5000
+LAPS_MAX = 1000
 Latitude = Annotated[float, Field(ge=-90.0, le=90.0)]
 Longitude = Annotated[float, Field(ge=-180.0, le=180.0)]
 Altitude = Annotated[float, Field(ge=-9000.0, le=9000.0)]
@@ -68,6 +69,8 @@ class PlacedTable(Table):
     anchor_yaw_deg: Finite = 0.0
     join: JoinKind = "smooth"
     time_scale: Positive = 1.0
+    laps: Annotated[int, Field(ge=1, le=LAPS_MAX)] = 1
+    """How often it is flown, with a way from its end back to its start between."""
     heading: HeadingTable = HeadingTable()
     limits: LimitsTable = LimitsTable()
 

@@ -22,6 +22,7 @@ from companion.trajectory.file_definition import FileDefinition, PlacedTable, Wa
 from companion.trajectory.files import Made, shape_of
 from companion.trajectory.formats import FORMATS
 from companion.trajectory.formats.reading import FILE_MAX_BYTES, Source, decoded, quoted, read_bytes, shown
+from companion.trajectory.laps import repeated
 from companion.trajectory.route import planned
 
 STORED_NAME = "trajectory"
@@ -117,7 +118,7 @@ def _from_file(
 ) -> Trajectory:
     text, suffix = _text_of(definition, source)
     made = shape_of(text, suffix, definition.options(vehicle))
-    return _placed(definition, made, name, source, time_scale)
+    return _placed(definition, made, name, source, time_scale, vehicle)
 
 
 def _text_of(definition: FileDefinition, source: str) -> tuple[Source, str]:
@@ -155,12 +156,16 @@ def _through_waypoints(
         raise InputError(f"{source}: {error}") from None
     except RefusedError as error:
         raise RefusedError(f"{source}: {error}") from None
-    return _placed(definition, Made(shape, shape.own_duration_s, notes), name, source, time_scale)
+    return _placed(definition, Made(shape, shape.own_duration_s, notes), name, source, time_scale, vehicle)
 
 
-def _placed(definition: PlacedTable, made: Made, name: str, source: str, time_scale: float | None) -> Trajectory:
+def _placed(
+    definition: PlacedTable, made: Made, name: str, source: str, time_scale: float | None, vehicle: Vehicle | None
+) -> Trajectory:
     """Return the trajectory of a shape that has its own duration."""
     scale = definition.time_scale if time_scale is None else time_scale
+    if definition.laps > 1:
+        made = _repeated(made, definition, scale, source, vehicle)
     return Trajectory(
         name=name,
         shape=made.shape,
@@ -172,6 +177,19 @@ def _placed(definition: PlacedTable, made: Made, name: str, source: str, time_sc
         origin=made.origin,
         fence=made.fence,
         notes=made.notes,
+    )
+
+
+def _repeated(made: Made, definition: PlacedTable, scale: float, source: str, vehicle: Vehicle | None) -> Made:
+    if vehicle is None:
+        raise InputError(f"{source}: laps = {definition.laps}: the way back takes a vehicle's limits: name a vehicle")
+    try:
+        shape = repeated(made.shape, made.duration_s, definition.laps, definition.limits.within(vehicle), scale)
+    except RefusedError as error:
+        raise RefusedError(f"{source}: {error}") from None
+    how = f"{shape.back_s / scale:.1f} s from the end back to the start between two" if shape.back_s else "closed"
+    return made._replace(
+        shape=shape, duration_s=shape.own_duration_s, notes=(*made.notes, f"{definition.laps} laps, {how}")
     )
 
 

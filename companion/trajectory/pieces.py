@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -61,10 +62,8 @@ class Chain:
 
     def at(self, t_s: float) -> Reference:
         """Return the reference of the piece whose turn it is; at a joint that of the piece that begins."""
-        for piece, start_s in zip(reversed(self.pieces), reversed(self.starts_s), strict=True):
-            if t_s >= start_s:
-                return piece.at(t_s - start_s)
-        return self.pieces[0].at(t_s)
+        index = max(bisect_right(self.starts_s, t_s) - 1, 0)
+        return self.pieces[index].at(t_s - self.starts_s[index])
 
     def joints(self) -> tuple[Joint, ...]:
         """Where the pieces meet, and the joints inside of each."""
