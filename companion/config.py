@@ -112,6 +112,8 @@ class Controller(Section):
     rate_lag_inversion: bool | tuple[bool, bool, bool] = True
     """One for all axes, or roll, pitch and yaw."""
     thrust_lag_compensation: bool = True
+    thrust_scale_estimate: bool = False
+    """Whether what a thrust command gives is followed in flight, within bounds (docs/tracking.md)."""
     prediction: bool = True
     measured_delay: bool = True
     """Whether the prediction goes by the measured age of the states; false where link.state_age_s and command_delay_s

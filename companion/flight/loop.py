@@ -262,8 +262,13 @@ class FlightLoop:
         figures = self._watch.delay_figures() if self._engagement is not None else {}
         return Outcome(
             *(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement, figures),
-            vehicle=vehicle_facts(self._autopilot, self._ops.version),
+            vehicle=vehicle_facts(self._autopilot, self._ops.version) | self._scale_fact(),
         )
+
+    def _scale_fact(self) -> dict[str, float]:
+        """What the thrust was found to be, over what the vehicle file says, where that is followed."""
+        scale = self._tracker.thrust_scale if isinstance(self._tracker, Tracker) else None
+        return {} if scale is None else {"thrust_scale": scale}
 
     def _fly(self) -> tuple[Cause, str]:
         try:

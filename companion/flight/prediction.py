@@ -74,6 +74,11 @@ class Prediction:
         self._count = math.ceil(delay_s / PIECE_MAX_S - 1e-9)
         self.length_s = delay_s / self._count if self._count else 0.0
 
+    def rescale(self, ratio: float) -> None:
+        """The same commands are believed to give `ratio` times as much thrust as until now."""
+        self.thrust *= ratio
+        self._acting = deque(acting._replace(thrust=ratio * acting.thrust) for acting in self._acting)
+
     def sent(self, stamp_s: float, thrust_n: float, rates: Sequence[float]) -> None:
         """Remembers a command (thrust [N], body rates [rad/s]) computed from the state stamped `stamp_s`."""
         self._acting.append(Acting(stamp_s + self._delay_s, thrust_n, (rates[0], rates[1], rates[2])))

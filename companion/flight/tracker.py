@@ -16,17 +16,27 @@ from companion import accelerate
 from companion.config import Vehicle
 from companion.control import flat
 from companion.control.heading import HeadingState
-from companion.control.law import ControllerState, Parameters, start, step
+from companion.control.law import (
+    LIMIT_THRUST_MAX,
+    LIMIT_THRUST_MIN,
+    ControllerState,
+    Parameters,
+    start,
+    step,
+)
 from companion.control.model import Factors, advance, factors
 from companion.control.output import Conversion, Setpoint, actuator_output, attitude_output, lead, rates_output
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
-from companion.control.vectors import add, axes, norm, scale
+from companion.control.vectors import add, axes, norm
+from companion.control.vectors import scale as scale_vector
 from companion.flight.prediction import Attitude, Piece, Prediction, refreshed
 from companion.flight.resets import Reset, about_vertical
 from companion.flight.retuning import Transition, Turning, between
+from companion.flight.thrust_scale import ThrustScale
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 PIECES_MAX = 100
+THRUST_LIMITS = LIMIT_THRUST_MIN | LIMIT_THRUST_MAX
 ReferenceAt = Callable[[float], Reference]
 Numbers = tuple[float, ...]
 
@@ -272,6 +282,7 @@ class Tracker:
         self._lags = self._factors()
         self._build: Callable[[Parameters], Engine] = lambda parameters: compiled.build(parameters, self._lags)
         self._engine = self._build(self.parameters)
+        self._scale = ThrustScale(vehicle) if vehicle.controller.thrust_scale_estimate else None
         self._transition: Transition | None = None
         self.transitions: list[Transition] = []
         """The ways to other parameters so far, the one under way among them."""
@@ -307,6 +318,9 @@ class Tracker:
             _, b_hat = start(thrust, state.q, model.mass, model.gravity, limits.disturbance_max)
         self._engine.begin(ControllerState(thrust, 0.0, b_hat, HeadingState(r2, r1, False), ZERO))
         self._prediction = self._new_prediction(thrust)
+        if self._scale is not None:
+            self._scale = ThrustScale(self.vehicle)
+            self._conversion = conversion(self.vehicle)
         self._slow_tau = ZERO
         self._last_s = None
         self._attitude = None
@@ -333,12 +347,46 @@ class Tracker:
         if self._transition is not None:
             self._follow(self._transition, stamp_s, state)
         pieces = prediction.pieces(stamp_s)
+        if self._scale is not None:
+            self._weigh(self._scale, stamp_s, state, integrate)
+            pieces = prediction.pieces(stamp_s)
         if self._attitude is not None and self._attitude.at_s > stamp_s:
             state = self._refreshed(state, stamp_s, self._attitude, pieces)
         reference = reference_at(stamp_s + self.delay_s)
         numbers = self._engine.step(state, reference, prediction.thrust, pieces, frozen or not integrate, integrate, dt)
         prediction.sent(stamp_s, numbers[flat.THRUST], numbers[flat.RATES_MODEL])
+        if self._scale is not None and int(numbers[flat.LIMITS]) & THRUST_LIMITS:
+            self._scale.interrupt()
         return TrackerStep(self._convert(numbers, dt), numbers)
+
+    # -- the thrust's scale ---------------------------------------------------------------------------------------
+
+    @property
+    def thrust_scale(self) -> float | None:
+        """What a thrust command gives, over what the vehicle file says; None: it is not followed."""
+        return None if self._scale is None else self._scale.used
+
+    def _weigh(self, scale: ThrustScale, stamp_s: float, state: State, whole: bool) -> None:
+        """Shows a state to the estimate of the thrust's scale, and takes a new scale over without a step.
+
+        What goes out stays: T, T' and the thrust that is under way become as much larger as the command for them gets
+        smaller. What is believed stays: b_hat takes up the difference, so that a of section 2 does not change.
+        """
+        if not whole:
+            scale.interrupt()
+        ratio = scale.on_state(stamp_s, state, self._prediction.thrust)
+        if ratio == 1.0:
+            return
+        controller, limits = self._engine.controller, self.parameters.limits
+        thrust = ratio * controller.thrust
+        r3 = axes(state.q)[2]
+        b_hat = add(controller.b_hat, scale_vector((thrust - controller.thrust) / self.parameters.model.mass, r3))
+        if not (limits.thrust_min < thrust < limits.thrust_max and norm(b_hat) < limits.disturbance_max):
+            return
+        scale.take(ratio)
+        self._prediction.rescale(ratio)
+        self._engine.begin(controller._replace(thrust=thrust, thrust_rate=ratio * controller.thrust_rate, b_hat=b_hat))
+        self._conversion = self._conversion._replace(thrust_full_n=self.vehicle.thrust_full_n * scale.used)
 
     # -- what the states alone do not tell ------------------------------------------------------------------------
 
@@ -384,10 +432,12 @@ class Tracker:
         heading, b_hat = controller.heading, add(controller.b_hat, reset.disturbance_m_s2)
         size, bound = norm(b_hat), self.parameters.limits.disturbance_max
         if size > bound:
-            b_hat = scale(bound / size, b_hat)
+            b_hat = scale_vector(bound / size, b_hat)
         heading = HeadingState(about_vertical(yaw, heading.r2d), about_vertical(yaw, heading.forward), heading.held)
         self._engine.begin(controller._replace(b_hat=b_hat, heading=heading))
         self._attitude = None
+        if self._scale is not None:
+            self._scale.interrupt()
 
     # -- other parameters in flight -------------------------------------------------------------------------------
 

@@ -62,6 +62,7 @@ def vehicle_values(template: Vehicle, entered: Entered, found: Identified, facts
         "link.state_age_s": _rounded(found.age_s if found.age_s is not None else found.delay_s),
         "link.command_delay_s": _rounded(found.delay_s if found.age_s is not None else 0.0),
         "controller.measured_delay": found.age_s is not None,
+        "controller.thrust_scale_estimate": True,
     }
     lags = [
         fit.lag_s if fit is not None else assumed

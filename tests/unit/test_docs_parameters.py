@@ -53,7 +53,7 @@ def test_an_entry_fits_the_protocol_and_the_vehicle_file(entry):
 def test_all_gains_and_the_heading_can_be_set():
     settable = {entry.key for entry in ENTRIES}
     switches = {"disturbance_start", "rate_lag_inversion", "thrust_lag_compensation", "prediction", "state_gap_max_s"}
-    switches |= {"drag_feedforward"}
+    switches |= {"drag_feedforward", "thrust_scale_estimate"}
     # What ends a flight is set in the vehicle file alone.
     guards = {
         "battery_min",
