@@ -11,7 +11,7 @@ PIP_INSTALL := env -u PIP_TARGET -u PIP_PREFIX -u PIP_ROOT -u PIP_REQUIREMENT -u
 unexport PYTHONHOME PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: demo test test-long test-plain lint format clean help
+.PHONY: fuzz audit demo test test-long test-plain lint format clean help
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1: \2/p' Makefile
@@ -58,6 +58,22 @@ lint: $(VENV)/.lint  ## Check style, types and import rules
 format: $(VENV)/.lint  ## Rewrite the code in the project's style
 	$(PY) -m ruff format .
 	$(PY) -m ruff check --fix .
+
+$(VENV)/.fuzz: $(VENV)/.test
+	@echo "installing what fuzzes into $(VENV) ..."
+	@$(PIP_INSTALL) -e '.[test,fast,fuzz]'
+	@touch $@
+
+$(VENV)/.audit: $(VENV)/.run
+	@echo "installing what audits into $(VENV) ..."
+	@$(PIP_INSTALL) -e '.[audit]'
+	@touch $@
+
+fuzz: $(VENV)/.fuzz  ## Fuzz everything that reads bytes from elsewhere: ten million inputs, an hour or more
+	$(PY) tools/fuzz.py
+
+audit: $(VENV)/.audit  ## Ask for known vulnerabilities of the pinned packages, where advisories can be reached
+	$(PY) tools/audit.py
 
 clean:  ## Remove what the targets above made
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
