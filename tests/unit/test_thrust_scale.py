@@ -37,7 +37,7 @@ def fly(monkeypatch, factor: float, *, on: bool = True, speed: float = 1.0, dura
     vehicle["link"]["state_rate_hz"] = RATE_HZ
     vehicle["controller"]["thrust_scale_estimate"] = on
     flight = embedded(
-        build_flight({**data, "vehicle": vehicle, "world": world, "statistics_from_s": 10.0}, "test"), speed
+        build_flight({**data, "vehicle": vehicle, "world": world, "statistics_from_s": 4.0}, "test"), speed
     )
     true = simulate.simulated_vehicle(flight)
     true = replace(true, rotor_thrust_max_n=factor * true.rotor_thrust_max_n)
@@ -97,14 +97,14 @@ def test_a_fast_flight_with_a_wrong_scale_gets_better_by_it(monkeypatch) -> None
     errors = {}
     for on in (False, True):
         with monkeypatch.context() as patch:
-            errors[on] = fly(patch, 1.1, on=on, speed=2.5, duration_s=15.0).summary["position_rms_m"]
+            errors[on] = fly(patch, 1.1, on=on, speed=2.5, duration_s=20.0).summary["position_rms_m"]
     assert errors[True] < 0.4 * errors[False]
 
 
 def test_the_scale_stays_within_its_bounds(monkeypatch) -> None:
     monkeypatch.setattr(thrust_scale, "BOUND", 0.05)
     bounded = fly(monkeypatch, 0.86, duration_s=9.0)
-    assert 0.95 - 1e-9 <= bounded.used.min() < 0.9502
+    assert 0.95 - 1e-9 <= bounded.used.min() < 0.952
 
 
 # ---- the estimate by itself ------------------------------------------------------------------------------------------
