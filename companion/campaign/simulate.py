@@ -125,6 +125,7 @@ def fly_sampled(
     compiled: Kernels,
     progress: Callable[[float], None] = lambda share: None,
     duration_max_s: float = math.inf,
+    real: vehicle_file.VehicleFile | None = None,
 ) -> Trace:
     """Flies against the bundled physics, from a hover at [start], for the length of the course.
 
@@ -134,13 +135,14 @@ def fly_sampled(
         compiled: the kernels of the control step; the physics runs on the same engine.
         progress: called now and then with the share that is done.
         duration_max_s: simulate no more of the course than this.
+        real: the vehicle that flies; None: what the flight's vehicle file says.
 
     Raises:
         RefusedError: the flight diverges.
     """
     vehicle = flight.vehicle
     position, yaw = start_of(flight)
-    sim = simulated_vehicle(flight)
+    sim = simulated_vehicle(flight) if real is None else real
     px4 = "1.13" if flight.output.kind == "actuators" else "1.18"
     airframe = Airframe(
         sim, simulated_world(flight), seed=flight.world.seed, engine=compiled.engine, start=(position, yaw), px4=px4
