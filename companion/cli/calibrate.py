@@ -27,6 +27,8 @@ from companion.cli.common import (
     FaultsOption,
     JsonOption,
     OutOption,
+    VehicleKeyOption,
+    VehicleSystemOption,
     adjustments,
     fault_file,
     flight_display,
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     from companion.flight.launch import Flown
     from companion.identification.identify import Identified
     from companion.identification.vehicle_file import Entered
+    from companion.link.vehicle_link import VehicleLink
 
 EXAMPLE = "Example: companion calibrate --mass 1.2 --vehicle bundled --connect udpin:127.0.0.1:14540"
 CONNECTION = "udpin:127.0.0.1:14540"
@@ -63,6 +66,8 @@ def run(
             help="udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; default udpin:127.0.0.1:14540.",
         ),
     ] = None,
+    key: VehicleKeyOption = None,
+    system: VehicleSystemOption = None,
     sim: Annotated[
         bool, typer.Option("--sim", help="Start the bundled vehicle of --vehicle and calibrate it.")
     ] = False,
@@ -95,7 +100,7 @@ def run(
     """Calibrates a vehicle and leaves a vehicle file."""
     from companion.errors import InputError
     from companion.identification.vehicle_file import Entered, template_of
-    from companion.link.transport import parse_connection
+    from companion.link.vehicle_link import VehicleLink
 
     template = template_of(vehicle)
     if not (isfinite(mass) and mass > 0.0):
@@ -112,15 +117,16 @@ def run(
     if from_flight is not None:
         folder = from_flight
     else:
-        connection = connect or CONNECTION
-        parse_connection(connection)
+        link = VehicleLink(connect or CONNECTION, key, system)
+        link.check()
         plan = {
             **{"rate_step_rad_s": rate_step, "thrust_step": thrust_step, "run_speed_m_s": speed, "repeats": repeats},
             "run_length_m": min(5.0, radius),
         }
         flight = configured(vehicle, entered, plan, height_m=height, radius_m=radius, start=sim)
         flown = _fly(
-            *(flight, None if sim else connection),
+            *(flight, link),
+            sim=sim,
             out=out,
             engine=engine,
             timeout_s=timeout,
@@ -182,20 +188,21 @@ def configured(
 
 def _fly(
     flight: Flight,
-    connection: str | None,
+    link: VehicleLink,
     *,
+    sim: bool,
     out: Path | None,
     engine: str,
     timeout_s: float,
     quiet: bool,
     faults: Path | None,
 ) -> Flown:
-    """Flies the manoeuvres; None for a connection: the bundled vehicle."""
+    """Flies the manoeuvres; with `sim` on the bundled vehicle."""
     from companion.flight.launch import control, prepare
 
     with flight_display(quiet=quiet, live=False, rerun=False, rerun_file=None) as display:
         folder = prepare(flight, out)
-        if connection is None:
+        if sim:
             return fly_bundled(
                 *(flight, folder),
                 px4="1.18",
@@ -205,10 +212,12 @@ def _fly(
                 timeout_s=timeout_s,
                 quiet=quiet,
                 display=display,
+                key=link.key,
             )
-        say(f"calibration of {flight.vehicle.name}, listening on {connection}; flight folder {folder}", quiet=quiet)
+        where = f"listening on {link.connection}; flight folder {folder}"
+        say(f"calibration of {flight.vehicle.name}, {where}", quiet=quiet)
         listen: Display = display
-        return control(folder, connection, engine, timeout_s, listen)
+        return control(folder, link, engine, timeout_s, listen)
 
 
 def _tell_failure(flown: Flown, *, as_json: bool) -> None:

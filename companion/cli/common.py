@@ -256,6 +256,10 @@ def print_summary(summary: Mapping[str, Any]) -> None:
             ("disturbance (north, east, down)", _vector(summary["disturbance_m_s2"], "m/s^2")),
             ("thrust", " to ".join(_figure(summary[k], "N", 1) for k in ("thrust_min_n", "thrust_max_n"))),
         ]
+    refused = summary.get("refused_messages") or {}
+    if refused:
+        told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in refused.items())
+        rows.append(("messages refused", told))
     rows.append(("largest tilt", _figure(summary["tilt_max_rad"], "rad", 2)))
     for name, value in rows:
         say(f"  {name:32s} {value}")
