@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from .airframe import Truth
@@ -29,7 +30,9 @@ class TruthLog:
 
     def __init__(self, path: Path) -> None:
         """Create the file. Raises OSError when that is not possible."""
-        self._file = path.open("w", encoding="ascii", newline="")
+        self._file = path.open("wb", buffering=0)
+        self._name = path.name
+        self._full = False
         self._rows: list[str] = [",".join(COLUMNS)]
 
     def write(self, truth: Truth) -> None:
@@ -49,5 +52,15 @@ class TruthLog:
             self._file.close()
 
     def _flush(self) -> None:
-        self._file.write("\n".join(self._rows) + "\n" if self._rows else "")
+        text = "\n".join(self._rows) + "\n" if self._rows else ""
         self._rows.clear()
+        content = memoryview(text.encode("ascii"))
+        try:
+            while content and not self._full:
+                content = content[self._file.write(content) or 0 :]
+        except OSError as error:  # a vehicle does not fall out of the air because a disk is full
+            self._full = True
+            print(
+                f"sim-link: {self._name}: {error.strerror}; nothing more is written, the flight goes on",
+                file=sys.stderr,
+            )

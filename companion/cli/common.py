@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.errors import InputError
+from companion.errors import CompanionError, InputError
 
 if TYPE_CHECKING:
     from companion.config import Flight
@@ -227,13 +227,18 @@ def report_flight(flown: Flown, *, as_json: bool) -> int:
             print(json.dumps(outcome, indent=2))
         return flown.exit_code
     summary = read_summary(flown.folder)
-    page = build_report(flown.folder)
+    page: Path | None = None
+    try:
+        page = build_report(flown.folder)
+    except CompanionError as error:  # the flight is flown, whatever becomes of its page
+        say(f"companion: {error}", quiet=True)
     if as_json:
         print(json.dumps({**summary, "folder": str(flown.folder), "exit_code": flown.exit_code}, indent=2))
         return flown.exit_code
     say(f"{flown.sentence}; {summary['steps']} control steps at {_figure(summary['control_rate_hz'], 'Hz', 0)}")
     print_summary(summary)
-    say(f"report:  {page}")
+    if page is not None:
+        say(f"report:  {page}")
     return flown.exit_code
 
 

@@ -29,11 +29,11 @@ from companion.flight.tracker import Kernels, kernels
 from companion.link.framing import refused_since
 from companion.link.vehicle_link import VehicleLink
 from companion.link.wire import Wire
-from companion.record.flight_record import FlightRecord
-from companion.record.folder import CONFIGURATION_FILE, write_summary
+from companion.record.flight_record import RECORD_FILE, FlightRecord
+from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, write_summary
 from companion.record.recorder import Recorder
 from companion.record.summary import FlightMeta, note_end, summarise
-from companion.record.ulog import Level
+from companion.record.ulog import ULOG_FILE, Level
 from companion.trajectory.anchored import Trajectory
 from companion.trajectory.load import of_flight
 
@@ -219,10 +219,28 @@ def _finish(folder: Path, flight: Any, trajectory: Any, record: FlightRecord, ou
         note_end(summary, outcome.told(), engagement, px4_parameters)
         if outcome.cause is Cause.COMPLETED and summary["verdict"] != "passed":
             code = int(ExitCode.MISSED)
-        record.save(folder)
-        write_summary(folder, summary)
+        if not _written(folder, record, summary, status):
+            status.line(f"verdict: {summary['verdict']}")
     status.send(outcome=outcome.sentence, cause=outcome.cause.name)
     return code
+
+
+def _written(folder: Path, record: FlightRecord, summary: dict[str, Any], status: Status) -> bool:
+    """Whether record and summary are on the disk; one that did not take them is no fault of the program, and said."""
+    parts: dict[str, Callable[[], object]] = {
+        RECORD_FILE: lambda: record.save(folder),
+        SUMMARY_FILE: lambda: write_summary(folder, summary),
+    }
+    done = True
+    for name, write in parts.items():
+        try:
+            write()
+        except OSError as error:
+            done = False
+            status.line(f"{folder / name}: cannot be written ({error.strerror}); {ULOG_FILE} holds the flight so far")
+            with contextlib.suppress(OSError):
+                (folder / f".{name}.part").unlink(missing_ok=True)
+    return done
 
 
 def main() -> int:

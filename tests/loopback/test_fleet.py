@@ -227,3 +227,14 @@ def test_more_than_there_are_ids_is_refused() -> None:
     done = sim_link("--instance", "248", "--count", "3")
     assert done.returncode == 2
     assert done.stderr.strip() == "sim-link: --count 3: from --instance 248 on there are 2"
+
+
+def test_a_full_disk_does_not_end_the_vehicle(capfd):
+    """Said once; the rest of the truth is not written."""
+    log = TruthLog(Path("/dev/full"))
+    for number in range(1200):
+        log.add(str(number))
+    log.close()
+    log.close()
+    said = "sim-link: full: No space left on device; nothing more is written, the flight goes on\n"
+    assert capfd.readouterr().err == said

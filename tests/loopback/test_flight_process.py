@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -29,7 +30,8 @@ GROUND_SIDE = """
 import sys
 from pathlib import Path
 from companion.flight.launch import control
-flown = control(Path(sys.argv[1]), sys.argv[2], "python", 30.0, lambda message: None)
+said = lambda message: print(message.get("line", ""), flush=True)
+flown = control(Path(sys.argv[1]), sys.argv[2], "python", 30.0, said)
 print(flown.sentence, file=sys.stderr)
 sys.exit(flown.exit_code)
 """
@@ -59,8 +61,8 @@ class Command:
                 continue
         self.process.communicate()
 
-    def children(self, name: str = "") -> list[int]:
-        """Process ids of its children whose command line holds a name."""
+    def children(self, name: str = "", of: int | None = None) -> list[int]:
+        """Process ids of its children, or another process's, whose command line holds a name."""
         found = []
         for folder in Path("/proc").iterdir():
             if not folder.name.isdigit():
@@ -70,7 +72,7 @@ class Command:
                 words = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
             except OSError:
                 continue
-            if parent == self.process.pid and name in words:
+            if parent == (of or self.process.pid) and name in words:
                 found.append(int(folder.name))
         return found
 
@@ -152,6 +154,27 @@ def test_killed_ground_side(tmp_path: Path) -> None:
     assert summary["verdict"] == "passed"
     assert summary["ended"] == "the flight was completed: the vehicle is in Hold"
     assert (tmp_path / "out" / "link.tlog").stat().st_size > 100_000
+
+
+def test_a_full_disk_costs_records_and_no_step(tmp_path: Path) -> None:
+    """From some moment of the flight on no file grows beyond 40 kB, as on a disk that is full. What did not fit is
+    counted and said; the flight ends as it would have, every state answered."""
+    with Stand(make_flight(), tmp_path) as stand, control(tmp_path, stand.port, 3.0) as command:
+        until(lambda: stand.offboard_s > 0.5)
+        for pid in (control_pid := command.control_pid, *command.children("companion.record.recorder", control_pid)):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (40_000, resource.RLIM_INFINITY))
+        code, out, err = command.ends()
+        assert stand.mode is Mode.HOLD
+    assert code == ExitCode.DONE, err
+    assert err.count("nothing more is written, the flight goes on") == 2
+    assert "Traceback" not in err
+    assert "link.tlog, flight.ulg: incomplete, the disk did not take everything" in out
+    assert "record.npz: cannot be written (File too large); flight.ulg holds the flight so far" in out
+    folder = tmp_path / "out"
+    assert not list(folder.glob("*.npz")) + list(folder.glob(".*"))
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["verdict"], summary["lost_setpoints"]) == ("passed", 0)
+    assert summary["duration_s"] == pytest.approx(3.0, abs=0.02)
 
 
 def test_ctrl_c_in_flight(tmp_path: Path) -> None:
