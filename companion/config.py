@@ -140,6 +140,8 @@ class FlightLimits(Section):
     disturbance_step_m_s2: NotNegative | None = None
     """Largest step of the horizontal disturbance that a flight is to bear; None: disturbance_max_m_s2."""
     disturbance_step_vertical_m_s2: NotNegative = 0.5
+    rate_error_max_rad_s: Positive = 1.0
+    """Roll and pitch rates together, against the commanded ones behind delay and lag."""
     state_rate_min: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)] = 0.6
     """Share of link.state_rate_hz."""
     state_age_max_s: Positive | None = None

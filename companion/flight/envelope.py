@@ -55,6 +55,8 @@ class Envelope:
     def excess(self, numbers: tuple[float, ...], now_s: float) -> tuple[float, float, str] | None:
         """V_H or a part of it that is above the envelope: the value, the envelope [m^2] and the part; None: within.
 
+        Of two parts that are above it is the one further above.
+
         Args:
             numbers: of a step (`control.flat`).
             now_s: vehicle time [s].
@@ -72,13 +74,15 @@ class Envelope:
             most = (math.sqrt(self._whole) + self.step_roots[0]) ** 2
             return (value, most, "all axes") if value > most else None
         decay = self._decay[min(int((now_s - self._start_s) / STRIDE_S), STRIDES)]
-        value = 0.5 * (z * z + z2 * z2 + z3 * z3 + z4 * z4)
+        vertical = 0.5 * (z * z + z2 * z2 + z3 * z3 + z4 * z4)
         root = decay * self._roots[1] + self.step_roots[1]
-        if value > root * root:
-            return value, root * root, "vertical"
-        value = 0.5 * (x * x + x2 * x2 + x3 * x3 + x4 * x4 + y * y + y2 * y2 + y3 * y3 + y4 * y4)
+        vertical_most = root * root
+        horizontal = 0.5 * (x * x + x2 * x2 + x3 * x3 + x4 * x4 + y * y + y2 * y2 + y3 * y3 + y4 * y4)
         root = decay * self._roots[0] + self.step_roots[0]
-        return (value, root * root, "horizontal") if value > root * root else None
+        horizontal_most = root * root
+        if vertical > vertical_most and vertical * horizontal_most >= horizontal * vertical_most:
+            return vertical, vertical_most, "vertical"
+        return (horizontal, horizontal_most, "horizontal") if horizontal > horizontal_most else None
 
 
 def _linear(gains: Gains, drag: float) -> tuple[list[float], float]:

@@ -35,6 +35,11 @@ BATTERY_CRITICAL = 0.5
 """Share of limits.battery_min below which the vehicle lands where it is."""
 
 
+RUNAWAY = 8.0
+"""V_H so many times above its envelope is no gust and no weak rotor any more: what is commanded makes it worse. A rotor
+that falls to 60 % reaches 7.6 times the vertical part."""
+
+
 class Response(IntEnum):
     """What is done, from the mildest to the hardest."""
 
@@ -75,6 +80,8 @@ class Guard(Enum):
     BEHIND = Rule(Cause.POSITION_ERROR, "controller.position_error_max_m", (Stage(0.5, Response.SLOW),))
     TILT = Rule(Cause.TILT, "limits.tilt_max_rad", (Stage(0.2, Response.HOLD),))
     LYAPUNOV = Rule(Cause.LYAPUNOV, "the envelope", (Stage(0.3, Response.REST), Stage(2.5, Response.HOLD)))
+    RUNAWAY = Rule(Cause.LYAPUNOV, "8 times the envelope", (Stage(0.1, Response.HOLD),))
+    FOLLOWING = Rule(Cause.NOT_FOLLOWING, "limits.rate_error_max_rad_s", (Stage(0.1, Response.HOLD),))
     DISTURBANCE = Rule(
         Cause.DISTURBANCE, "limits.disturbance_max_m_s2", (Stage(2.0, Response.SLOW), Stage(5.0, Response.REST))
     )
@@ -157,7 +164,9 @@ class Guards:
         if self._envelope is not None:
             self._envelope.restart()
 
-    def step(self, q: Quat, error: Vec3, numbers: tuple[float, ...], now_s: float) -> Finding | None:
+    def step(
+        self, q: Quat, error: Vec3, numbers: tuple[float, ...], now_s: float, rate_error: float = 0.0
+    ) -> Finding | None:
         """Judges a control step.
 
         Args:
@@ -165,6 +174,7 @@ class Guards:
             error: position less reference, NED [m].
             numbers: of the step (`control.flat`).
             now_s: vehicle time [s].
+            rate_error: how far the body rates are off the commanded ones [rad/s] (`flight.following`).
 
         Returns:
             what is to be done now, the hardest of several.
@@ -181,6 +191,10 @@ class Guards:
             found = _harder(
                 found, self._judge(Guard.TILT, tilt > limits.tilt_max_rad, tilt, limits.tilt_max_rad, "rad", now_s)
             )
+        broken = rate_error > limits.rate_error_max_rad_s
+        if broken or Guard.FOLLOWING in self._since:
+            limit = limits.rate_error_max_rad_s
+            found = _harder(found, self._judge(Guard.FOLLOWING, broken, rate_error, limit, "rad/s", now_s))
         bound = self._vehicle.controller.position_error_max_m
         self._near = self._near or size < bound
         if flags or size > bound or self._since:
@@ -188,11 +202,20 @@ class Guards:
         if self._envelope is not None:
             excess = self._envelope.excess(numbers, now_s)
             if excess is not None:
-                value, most, part = excess
-                detail = f"V_H ({part}) {value:.3g} m^2, envelope {most:.3g} m^2"
-                found = _harder(found, self._broken(Guard.LYAPUNOV, detail, now_s))
+                found = _harder(found, self._beyond_envelope(excess, now_s))
             elif Guard.LYAPUNOV in self._since:
                 self._clear(Guard.LYAPUNOV)
+                self._clear(Guard.RUNAWAY)
+        return found
+
+    def _beyond_envelope(self, excess: tuple[float, float, str], now_s: float) -> Finding | None:
+        """V_H is above its envelope, or far above it."""
+        value, most, part = excess
+        detail = f"V_H ({part}) {value:.3g} m^2, envelope {most:.3g} m^2"
+        found = self._broken(Guard.LYAPUNOV, detail, now_s)
+        if value > RUNAWAY * most:
+            return _harder(found, self._broken(Guard.RUNAWAY, detail, now_s))
+        self._clear(Guard.RUNAWAY)
         return found
 
     def _strained(self, flags: int, size: float, numbers: tuple[float, ...], now_s: float) -> Finding | None:

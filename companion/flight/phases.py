@@ -61,6 +61,7 @@ class Cause(Enum):
     POSITION_ERROR = Ending("the position error left its limit", ExitCode.LOST)
     TILT = Ending("the tilt left its limit", ExitCode.LOST)
     LYAPUNOV = Ending("the vehicle does not behave as its model says (V_H left its envelope)", ExitCode.LOST)
+    NOT_FOLLOWING = Ending("the vehicle does not turn as it is told", ExitCode.LOST)
     DISTURBANCE = Ending("the disturbance estimate is at its bound", ExitCode.LOST)
     THRUST = Ending("the thrust is at its limit", ExitCode.LOST)
     RATES = Ending("the commanded rates are at their limit", ExitCode.LOST)

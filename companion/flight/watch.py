@@ -14,10 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.config import Flight
+from companion.control import flat
 from companion.control.types import State, Vec3
 from companion.flight.controller import Controller
 from companion.flight.course import Course
 from companion.flight.delay import Delay
+from companion.flight.following import Following
 from companion.flight.guards import Finding, Guards, Slow
 from companion.flight.phases import Autopilot
 from companion.flight.resets import Resets
@@ -79,6 +81,9 @@ class Watch:
         self._tracker = controller if isinstance(controller, Tracker) else None
         self._controller, self._autopilot, self._limits = controller, autopilot, vehicle.limits
         self._guards = Guards(vehicle, None if self._tracker is None else self._tracker.parameters)
+        by_rates = self._tracker is not None and flight.output.sends == "rates"
+        self._following = Following(vehicle.autopilot.rate_lag_s) if by_rates else None
+        """None where no body rates are commanded."""
         self._retuned = False
         self._steps = self._late = 0
         self._counts: deque[_Count] = deque(maxlen=RATES_OVER + 1)
@@ -120,6 +125,8 @@ class Watch:
         """The controller has taken over: the next step is the first."""
         self._guards.restart()
         self._counts.clear()
+        if self._following is not None:
+            self._following.begin()
 
     def on_step(self, seen: Seen, course: Course, now_s: float) -> Finding | None:
         """Judges a control step whose setpoint is out; what is to be done about it."""
@@ -133,7 +140,7 @@ class Watch:
                 self._guards.retune(tracker.parameters)
         self._steps += 1
         self._late += seen.late
-        found = self._guards.step(seen.state.q, seen.error, seen.out.numbers, now_s)
+        found = self._guards.step(seen.state.q, seen.error, seen.out.numbers, now_s, self._rate_error(seen))
         if seen.age_s is not None:
             delay_s = self.delay.on_age(seen.age_s, now_s)
             if delay_s is not None and tracker is not None:
@@ -143,6 +150,13 @@ class Watch:
         self._slowly_s = now_s
         slow = self._guards.slowly(self._slow(seen, course, now_s), now_s)
         return slow if found is None or (slow is not None and slow.response > found.response) else found
+
+    def _rate_error(self, seen: Seen) -> float:
+        """How far the body rates are off the commanded ones [rad/s]; 0 where it is not known."""
+        if self._following is None or self._tracker is None:
+            return 0.0
+        state, (roll, pitch, yaw) = seen.state, seen.out.numbers[flat.RATES]
+        return self._following.error(state.t_vehicle_us * 1e-6, state.w, (roll, pitch, yaw), self._tracker.delay_s)
 
     def _slow(self, seen: Seen, course: Course, now_s: float) -> Slow:
         counts = self._counts

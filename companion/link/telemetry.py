@@ -34,6 +34,8 @@ FAR_BACK_US: Final = 2_000_000
 FAR_AHEAD_US: Final = 10_000_000
 """A stamp further ahead must be confirmed by the next one: a single wrong one would shut out all that follow."""
 CONFIRMATIONS: Final = 3
+FROZEN_ABOVE: Final = 1e-3
+"""A vehicle that says it moves or turns faster than this [m/s, rad/s] is somewhere else in the next state."""
 
 
 class StateRejection(Enum):
@@ -43,6 +45,7 @@ class StateRejection(Enum):
     UNKNOWN_FRAME = "the state is in a frame that is not supported (position LOCAL_NED, velocity LOCAL_NED or BODY_FRD)"
     NO_STAMP = "the state has no time stamp"
     REPEATED = "the state has the same time stamp as the one before"
+    FROZEN = "the state is number for number the one before, though the vehicle moves: the estimate stands still"
     BACK_IN_TIME = "the state is older than the one before"
     FAR_AHEAD = "the state's time stamp jumped ahead by more than 10 s"
     REBOOTED = "the autopilot's clock started again: it was rebooted"
@@ -97,6 +100,8 @@ class Telemetry:
         self.rejected: dict[StateRejection, int] = dict.fromkeys(StateRejection, 0)
         """Messages not taken, by reason."""
         self._last_us: int | None = None
+        self._numbers: tuple[Vec3, Vec3, Quat, Vec3] | None = None
+        """Of the last message whose stamp was sound."""
         self._ahead_us: int | None = None
         self._back_us: int | None = None
         self._back_count = 0
@@ -129,6 +134,10 @@ class Telemetry:
         late = self._judge_stamp(message.time_usec)
         if late is not None:
             return late
+        numbers, before = (message.p, message.v, message.q, message.w), self._numbers
+        self._numbers = numbers
+        if numbers == before and max(map(abs, (*message.v, *message.w))) > FROZEN_ABOVE:
+            return StateRejection.FROZEN
         if message.quality < 0:
             return StateRejection.ESTIMATOR_FAILED
         q = _unit(message.q)
@@ -204,6 +213,7 @@ class Telemetry:
     def restart(self) -> None:
         """Forget the past (not the counts): after a recognised reboot, before a new flight."""
         self._last_us = self._ahead_us = self._back_us = None
+        self._numbers = None
         self._back_count = 0
         self._rebooted = False
         self._attitude_us = -1

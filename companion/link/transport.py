@@ -139,11 +139,20 @@ class UdpTransport:
         return self._socket.fileno()
 
     def read(self) -> tuple[bytes, Address | None] | None:
-        """One datagram and its sender, or None."""
+        """One datagram and its sender, or None.
+
+        Raises:
+            OSError: the network reports that something sent before cannot arrive.
+            LinkError: the socket is gone.
+        """
         try:
             return self._socket.recvfrom(_DATAGRAM_BYTES)
         except BlockingIOError:
             return None
+        except OSError as error:
+            if error.errno in {errno.EBADF, errno.ENOTSOCK}:  # nothing will ever come here again
+                raise LinkError("the link's socket was closed underneath this program") from error
+            raise
 
     def write(self, data: bytes, to: Address | None) -> bool:
         """Send one datagram to `to`, or to the connected peer."""
@@ -159,8 +168,9 @@ class UdpTransport:
         return True
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
+        """Close the socket; one that is gone already is no matter."""
+        with contextlib.suppress(OSError):
+            self._socket.close()
 
 
 def _resolve(host: str, port: int, kind: str) -> Address:

@@ -19,6 +19,7 @@ from flight_cases import (
 
 from companion.config import find
 from companion.flight.phases import Cause
+from companion.frames import tilt_from_quat
 from sim_link import codec
 from sim_link.modes import Mode
 
@@ -126,6 +127,28 @@ def test_a_step_of_the_wind_is_borne_and_a_weak_rotor_is_noticed(tmp_path) -> No
     assert len(stand.setpoints(since_s)) == pytest.approx(RATE_HZ * (asked_s - since_s), abs=5)
 
 
+def test_setpoints_that_arrive_late_are_noticed_before_the_vehicle_turns_over(tmp_path) -> None:
+    """0.3 s on their way: the loop is unstable, and the order to hold is as late."""
+    tilts: list[float] = []
+
+    def watch(stand: Stand) -> None:
+        for i in range(400):
+            stand.after_offboard(AT_S + 0.01 * i, lambda: tilts.append(tilt_from_quat(truth(stand).q)))
+
+    late = {"delay_s": 0.3, "direction": "to_vehicle"}
+    stand, flown = fly(tmp_path, ("delay", late), prepare=watch, hover_s=8.0)
+    assert flown.cause in {Cause.NOT_FOLLOWING, Cause.LYAPUNOV}, flown.outcome.sentence
+    assert stand.mode is Mode.HOLD
+    assert max(tilts) < 1.0
+
+
+def test_an_estimate_that_stands_still_is_not_flown_on(tmp_path) -> None:
+    stand, flown = fly(tmp_path, ("estimator_freeze", {"for_s": 1.0}), hover_s=8.0)
+    assert flown.cause is Cause.STATE_LOST
+    assert flown.outcome.rejected_states["FROZEN"] > 0
+    assert len(stand.setpoints(AT_S + 0.02)) == 1  # the coast setpoint
+
+
 # The others
 
 
@@ -214,7 +237,7 @@ def test_guard(what: str, tmp_path) -> None:
 
 
 def test_a_vehicle_that_is_disarmed_in_the_air_gets_no_setpoint_any_more(tmp_path) -> None:
-    stand, flown = fly(tmp_path, prepare=killed)
+    stand, flown = fly(tmp_path, prepare=killed, **WIDE)  # else the guards are quicker than HEARTBEAT
     assert flown.cause is Cause.DISARMED
     assert stand.setpoints(AT_S + 1.1) == []  # HEARTBEAT comes once per second
 

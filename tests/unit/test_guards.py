@@ -11,12 +11,14 @@ from companion.control import flat
 from companion.control.certificate import linear_loop
 from companion.control.law import LIMIT_DISTURBANCE, LIMIT_ROLL_PITCH_RATE, LIMIT_THRUST_MAX
 from companion.flight.envelope import Envelope
-from companion.flight.guards import Guard, Guards, Response, Slow
+from companion.flight.guards import RUNAWAY, Guard, Guards, Response, Slow, disturbance_step
 from companion.flight.phases import Cause
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 STEP_S = 0.01
 VEHICLE = load_vehicle("bundled")
+PARAMETERS = VEHICLE.parameters()
+VEHICLE_ENVELOPE = Envelope(PARAMETERS.gains, PARAMETERS.model.drag, disturbance_step(VEHICLE.limits))
 
 
 def numbers(flags: int = 0, b_hat: float = 0.0, errors: tuple[float, ...] = (0.0,) * 12) -> tuple[float, ...]:
@@ -206,6 +208,33 @@ def test_the_guard_answers_what_stays_above_the_envelope() -> None:
     assert watched.steps(3.0, n=numbers(errors=spread(0.3, 0))) == []
 
 
+def test_what_is_far_above_the_envelope_is_answered_at_once() -> None:
+    root = VEHICLE_ENVELOPE.step_roots[1]
+    for share, expected in ((1.02, [(0.1, Guard.RUNAWAY, Response.HOLD)]), (0.98, [])):
+        watched = Watched()
+        watched.steps(6.5)  # what was there at the start has decayed
+        errors = (0.0, 0.0, math.sqrt(2.0 * RUNAWAY * share) * root, *(0.0,) * 9)
+        found = watched.steps(0.2, n=numbers(errors=errors))
+        assert found == [(pytest.approx(at, abs=0.011), guard, response) for at, guard, response in expected]
+        # It has to last: back under it for a moment, and it begins anew.
+        watched.steps(0.02)
+        assert watched.steps(0.09, n=numbers(errors=errors)) == []
+
+
+def test_rates_that_are_not_followed() -> None:
+    watched = Watched()
+    limit = VEHICLE.limits.rate_error_max_rad_s
+    step = lambda off: watched.guards.step(LEVEL, (0.0, 0.0, 0.0), numbers(), watched.now_s, off)  # noqa: E731
+    for off, expected in ((0.99 * limit, None), (1.01 * limit, Guard.FOLLOWING)):
+        found = []
+        for _ in range(12):
+            watched.now_s += STEP_S
+            found.append(step(off))
+        guards = [finding.guard for finding in found if finding is not None]
+        assert guards == ([] if expected is None else [expected])
+    assert found[-2] is not None or found[-1] is not None
+
+
 def test_errors_at_the_start_and_after_a_reset_are_not_held_against_the_vehicle() -> None:
     far = (*(20.0, 3.0, 5.0), *(1.0, 0.2, 0.3), *(0.5, 0.1, 0.2), *(0.1, 0.1, 0.1))
     watched = Watched()
@@ -213,7 +242,8 @@ def test_errors_at_the_start_and_after_a_reset_are_not_held_against_the_vehicle(
     near = tuple(0.1 * x if i % 3 == 2 else 0.0 for i, x in enumerate(far))
     assert watched.steps(0.2, n=numbers(errors=near)) == []
     watched.steps(0.5)
-    assert watched.steps(0.5, n=numbers(errors=near))[0][1] is Guard.LYAPUNOV  # by now they should be gone
+    found = watched.steps(0.5, n=numbers(errors=near))  # by now they should be gone
+    assert [guard for _, guard, _ in found] == [Guard.RUNAWAY, Guard.LYAPUNOV]
     watched.steps(0.5)
     watched.guards.restart()
     assert watched.steps(0.1, n=numbers(errors=spread(0.02, 2))) == []

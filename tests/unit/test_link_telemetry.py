@@ -18,7 +18,7 @@ def odometry(
     t_us: int = 20_000_000,
     frame_id: int = 1,
     child: int = 1,
-    p=(1.0, 2.0, -3.0),
+    p=None,
     q=LEVEL,
     v=(0.5, 0.25, -0.125),
     w=(0.0, 0.0, 0.0),
@@ -27,6 +27,8 @@ def odometry(
     system: int = 1,
     component: int = 1,
 ) -> Frame:
+    if p is None:  # it moves
+        p = (1.0 + 0.5 * ((t_us - 20_000_000) % 10_000_000) * 1e-6, 2.0, -3.0)
     payload = struct.pack("<Q13f168xBBBBb", t_us, *p, *q, *v, *w, frame_id, child, resets, 8, quality)
     return Frame(codec.ODOMETRY, system, component, 0, payload, b"", 0)
 
@@ -137,6 +139,23 @@ def test_time_must_go_on():
     assert telemetry.on_odometry(odometry(19_996_000)) is StateRejection.BACK_IN_TIME
     assert isinstance(telemetry.on_odometry(odometry(20_004_000)), VehicleState)
     assert telemetry.accepted == 2
+
+
+def test_an_estimate_that_stands_still_while_its_stamps_go_on_is_refused():
+    telemetry = Telemetry(1)
+    here = {"p": (1.0, 2.0, -3.0)}
+    moves, turns, rests = here, here | {"v": (0.0, 0.0, 0.0), "w": (0.0, 0.0, 0.01)}, here | {"v": (0.0005, 0.0, 0.0)}
+    for i, still in enumerate((moves, turns)):
+        base_us = 20_000_000 + 100_000 * i
+        assert isinstance(telemetry.on_odometry(odometry(base_us, **still)), VehicleState)
+        assert telemetry.on_odometry(odometry(base_us + 10_000, **still)) is StateRejection.FROZEN
+        assert telemetry.on_odometry(odometry(base_us + 20_000, **still)) is StateRejection.FROZEN
+        assert isinstance(
+            telemetry.on_odometry(odometry(base_us + 30_000, **still | {"p": (1.0, 2.0, -3.001)})), VehicleState
+        )
+    # A vehicle at rest without noise may well be where it was.
+    for t_us in (21_000_000, 21_010_000, 21_020_000):
+        assert isinstance(telemetry.on_odometry(odometry(t_us, **rests)), VehicleState)
 
 
 def test_a_state_without_a_stamp_is_refused():
