@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from flight_cases import (
 )
 
 from companion.config import find
+from companion.flight.guards import Guard
 from companion.flight.phases import Cause
 from companion.frames import tilt_from_quat
 from sim_link import codec
@@ -165,6 +167,19 @@ def altered(stand: Stand) -> None:
     stand.alter = without_velocity
 
 
+def critical(stand: Stand) -> None:
+    """HEARTBEAT says critical, while the mode stays Offboard."""
+
+    def alter(stand: Stand, msg_id: int, raw: bytes) -> list[bytes]:
+        if msg_id != codec.ID_HEARTBEAT or stand.offboard_s < AT_S:
+            return [raw]
+        payload = bytearray(codec.frames(raw)[0].payload.ljust(9, b"\0"))
+        payload[7] = codec.mavlink.MAV_STATE_CRITICAL
+        return [codec.Encoder(stand.vehicle.system, 1).hot(codec.ID_HEARTBEAT, bytes(payload))]
+
+    stand.alter = alter
+
+
 def deaf(stand: Stand) -> None:
     """The vehicle hears no setpoint any more."""
     stand.deaf = lambda stand, frame: stand.offboard_s > AT_S and frame.msg_id == codec.ID_SET_ATTITUDE_TARGET
@@ -221,6 +236,21 @@ CASES: dict[str, tuple[list[tuple[str, dict[str, Any]]], dict[str, Any], Cause, 
         WIDE,
         *(Cause.DISTURBANCE, "limit 6 (limits.disturbance_max_m_s2)", Mode.HOLD),
     ),
+    "a tilt": (
+        [("wind", {"wind_m_s": [4.0, 0.0, 0.0]})],
+        {**WIDE, "vehicle__limits__tilt_max_rad": 0.25},
+        *(Cause.TILT, "rad, limit 0.25 (limits.tilt_max_rad) for 0.2 s", Mode.HOLD),
+    ),
+    "a position error": (
+        [("wind", {"wind_m_s": [4.0, 0.0, 0.0]})],
+        {**WIDE, "vehicle__limits__position_error_abort_m": 0.15},
+        *(Cause.POSITION_ERROR, "m, limit 0.15 (limits.position_error_abort_m)", Mode.HOLD),
+    ),
+    "a state that is critical": (
+        [],
+        {"prepare": critical},
+        *(Cause.FAILSAFE, "its HEARTBEAT says critical", Mode.HOLD),
+    ),
     "a failsafe": ([], {"prepare": deaf}, Cause.FAILSAFE, "the autopilot reports Hold", Mode.HOLD),
 }
 
@@ -234,6 +264,41 @@ def test_guard(what: str, tmp_path) -> None:
     assert says in flown.outcome.sentence
     assert flown.cause.value.sentence in flown.outcome.sentence
     assert stand.mode is mode
+
+
+def test_a_vehicle_that_is_behind_gets_a_slower_reference(tmp_path) -> None:
+    """The error is beyond what the law reacts to, for longer than half a second."""
+    weak = {
+        **{"vehicle__controller__position_error_max_m": 0.15, "vehicle__limits__disturbance_max_m_s2": 1.7},
+        **WIDE,
+    }
+    _, flown = fly(tmp_path, ("wind", {"wind_m_s": [2.5, 0.0, 0.0], "for_s": 1.5}), hover_s=8.0, **weak)
+    told = [line for line in flown.lines if line.startswith("the reference slows down")]
+    assert any("the position error left its limit" in line for line in told), flown.lines
+    assert any("limit 0.15 (controller.position_error_max_m) for 0.5 s" in line for line in told), told
+
+
+SHOWN = {
+    **dict.fromkeys((Guard.POSITION_ERROR, Guard.TILT, Guard.DISTURBANCE, Guard.THRUST, Guard.RATES), "test_guard"),
+    **dict.fromkeys((Guard.STATE_RATE, Guard.STATE_AGE, Guard.ESTIMATOR, Guard.FENCE, Guard.FAILSAFE), "test_guard"),
+    **dict.fromkeys((Guard.BATTERY, Guard.BATTERY_CRITICAL), "test_guard"),
+    Guard.BEHIND: "test_a_vehicle_that_is_behind_gets_a_slower_reference",
+    Guard.LYAPUNOV: "test_a_step_of_the_wind_is_borne_and_a_weak_rotor_is_noticed",
+    Guard.LATE_STEPS: "test_steps_that_go_out_late_bring_the_flight_to_rest",
+    Guard.LINK: "test_an_autopilot_that_answers_no_more_is_left",
+}
+"""The test in which a flight of the bundled vehicle breaks the guard; the last two are not judged in lockstep, and fly
+against a turned clock in tests/unit/test_flight_real_time.py."""
+
+
+def test_every_guard_is_broken_by_a_flight_of_the_bundled_vehicle() -> None:
+    assert set(SHOWN) == set(Guard)
+    here = Path(__file__)
+    sources = here.read_text() + (here.parents[1] / "unit" / "test_flight_real_time.py").read_text()
+    for test in SHOWN.values():
+        assert f"def {test}(" in sources
+    by_cases = {cause for _, _, cause, _, _ in CASES.values()}
+    assert {guard.value.cause for guard, test in SHOWN.items() if test == "test_guard"} == by_cases
 
 
 def test_a_vehicle_that_is_disarmed_in_the_air_gets_no_setpoint_any_more(tmp_path) -> None:

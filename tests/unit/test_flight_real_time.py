@@ -133,12 +133,17 @@ def plain(value: Any) -> Any:
     return [plain(item) for item in value] if isinstance(value, tuple) else value
 
 
-@pytest.fixture
-def flight() -> Flight:
+def hovering(duration_s: float, **limits: float) -> Flight:
     vehicle = read_toml(find("paper", "vehicles"))
     vehicle["link"]["state_rate_hz"] = 100.0
-    hover = {"name": "hover", "shape": "hover", "duration_s": 1.0, "hover": {"point_m": [0.0, 0.0, 0.0]}}
+    vehicle["limits"] |= limits
+    hover = {"name": "hover", "shape": "hover", "duration_s": duration_s, "hover": {"point_m": [0.0, 0.0, 0.0]}}
     return build_flight({"name": "test", "vehicle": vehicle, "trajectory": hover}, "test")
+
+
+@pytest.fixture
+def flight() -> Flight:
+    return hovering(1.0)
 
 
 @pytest.fixture
@@ -294,3 +299,43 @@ def test_rebooted_autopilot_is_asked_for_hold_on_the_wall_clock(flight: Flight, 
     assert outcome.cause is Cause.REBOOTED
     assert wire.vehicle.autopilot.mode is Mode.HOLD
     assert len(wire.setpoints(0.85)) <= 1
+
+
+def test_an_autopilot_that_answers_no_more_is_left(wire: VirtualWire) -> None:
+    """States go on, answers to our TIMESYNC do not: what we send may not arrive either."""
+    send = wire.send
+
+    def answered(msgid: int, payload: bytes) -> bool:
+        """What the vehicle's link does: every request is answered with its time, until it hears us no more."""
+        if msgid == TIMESYNC:
+            tc1, ts1 = codec.timesync(payload)
+            if tc1 == 0 and wire.offboard_s < 0.5:
+                reply = codec.TIMESYNC.pack(wire.vehicle.t_us * 1000, ts1, 1, 191)
+                wire.later.append(codec.Encoder(1, 1).hot(TIMESYNC, reply))
+        return send(msgid, payload)
+
+    wire.send = answered  # type: ignore[method-assign]
+    outcome, _ = fly(hovering(6.0, link_silence_max_s=1.0), wire)
+    assert outcome.cause is Cause.LINK_ONE_WAY
+    assert "s without an answer, limit 1 (limits.link_silence_max_s)" in outcome.sentence
+    assert wire.vehicle.autopilot.mode is Mode.HOLD
+    assert wire.holds(0.5)[0] == pytest.approx(1.6, abs=0.2)
+
+
+def test_steps_that_go_out_late_bring_the_flight_to_rest(wire: VirtualWire) -> None:
+    """A machine that is too slow: every setpoint leaves 4 ms after its state, of 10 ms between two."""
+    send, told = wire.send, []
+
+    def slowly(msgid: int, payload: bytes) -> bool:
+        if msgid == codec.ID_SET_ATTITUDE_TARGET and wire.offboard_s >= 0.5:
+            wire.now_ns += 4_000_000
+        return send(msgid, payload)
+
+    wire.send = slowly  # type: ignore[method-assign]
+    flight = hovering(20.0)
+    record = FlightRecord(4000, PHASE_NAMES)
+    outcome = FlightLoop(flight, of_flight(flight), wire, record, kernels("python"), told.append).run()  # type: ignore[arg-type]
+    assert outcome.cause is Cause.LATE_STEPS
+    assert "of the steps, limit 0.3 (limits.late_steps_max) for 5.0 s" in outcome.sentence
+    assert any("the reference slows down" in line and "late_steps_max" in line for line in told), told
+    assert wire.vehicle.autopilot.mode is Mode.HOLD
