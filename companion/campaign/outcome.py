@@ -31,9 +31,7 @@ class Measure(NamedTuple):
 
 MEASURES: Final[dict[str, Measure]] = {
     "settled_at_s": Measure("s", "time on the trajectory after which the error stays below the bound"),
-    "rms_m": Measure(
-        "m", "rms of the position error after settling (from statistics_from_s, where the flight has one)"
-    ),
+    "rms_m": Measure("m", "rms of the position error after settling"),
     "p95_m": Measure("m", "95 % of the position errors after settling are below this"),
     "max_m": Measure("m", "largest position error after settling"),
     "track_rms_m": Measure("m", "rms of the position error over the whole trajectory"),

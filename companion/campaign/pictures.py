@@ -17,8 +17,8 @@ from companion.record.charts import AXES, FAINT, GRID, INK, axis_style, base_lay
 FloatArray = NDArray[np.float64]
 Figure = dict[str, Any]
 
-CELLS: Final = 18
-"""Cells of a slice along each axis, where the variable is drawn and not on a grid."""
+CELLS_MIN, CELLS_MAX, FLIGHTS_PER_CELL = 5, 20, 12
+"""Cells of a slice along each axis, where the variable is not on a grid: so many that each has some flights."""
 POINTS_MAX: Final = 4000
 """Flights that are drawn one by one."""
 GOOD, SLOW, BAD, GROUND = "#12805c", "#dd8a13", "#b42318", "#6b4e16"
@@ -90,7 +90,8 @@ def _edges(study: Study, name: str, values: FloatArray) -> FloatArray:
     if grid is not None and len(grid) > 1:
         step = grid[1] - grid[0]
         return np.array([grid[0] - step / 2, *(x + step / 2 for x in grid)])
-    return np.linspace(float(values.min()), float(values.max()) or 1.0, CELLS + 1)
+    cells = min(max(CELLS_MIN, int((len(values) / FLIGHTS_PER_CELL) ** 0.5)), CELLS_MAX)
+    return np.linspace(float(values.min()), float(values.max()), cells + 1)
 
 
 def slice_share(study: Study, table: Any, picture: Slice, key: str) -> Figure:
@@ -164,19 +165,28 @@ def sensitivities(found: dict[str, Sequence[Sensitivity]]) -> Figure | None:
             {
                 "type": "bar",
                 "orientation": "h",
-                "y": [v.replace("_", " ") + (" (distance)" if by_name[v].by_distance else "") for v in shown],
+                "y": [v.replace("_", " ") for v in shown],
                 "x": [by_name[v].partial for v in shown],
                 "name": {"converged": "convergence", "track_rms_m": "rms of the track"}.get(
                     name, name.replace("_", " ")
                 ),
-                "marker": {"color": colour},
-                "hovertemplate": "%{y}: %{x:.2f}<extra></extra>",
+                "marker": {
+                    "color": colour,
+                    "pattern": {"shape": ["/" if by_name[v].by_distance else "" for v in shown], "size": 6},
+                },
+                "text": ["by its distance from the median" if by_name[v].by_distance else "" for v in shown],
+                "textposition": "none",
+                "hovertemplate": "%{y}: %{x:.2f} %{text}<extra></extra>",
             }
         )
     noise = max(rows[0].noise for _, rows in outcomes)
     layout = base_layout() | {"barmode": "group", "legend": _legend(), "hovermode": "closest"}
     layout["xaxis"] = axis_style("Partial rank correlation") | {"range": [-1, 1]}
-    layout["yaxis"] = axis_style("") | {"ticks": "", "automargin": True}
+    layout["yaxis"] = axis_style("") | {
+        "ticks": "",
+        "automargin": True,
+        "categoryarray": [v.replace("_", " ") for v in order],
+    }
     band = {"type": "rect", "xref": "x", "yref": "paper", "x0": -noise, "x1": noise, "y0": 0, "y1": 1, "layer": "below"}
     layout["shapes"] = [band | {"fillcolor": GRID, "line": {"width": 0}}]
     return {"key": "sensitivity", "data": data, "layout": layout}

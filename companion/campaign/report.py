@@ -114,7 +114,8 @@ def _figures(
     add(
         "What matters",
         "Spearman's rank correlation with the effect of the other variables taken out. Positive: more of it, more of"
-        " the outcome. Within the grey band it may be chance. “Distance”: from the variable's median, to either side.",
+        " the outcome. Within the grey band it may be chance. Hatched: by the distance from the"
+        " variable's median, to either side.",
         [pictures.sensitivities({k: v for k, v in ranked.items() if v})],
         120 + 44 * bars,
     )

@@ -11,7 +11,7 @@ import itertools
 import json
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -153,7 +153,12 @@ class Study:
         Raises:
             InputError: the values make no flight together.
         """
-        return _case(self, self.values(number), self.flight_seed(number), f"{self.source}: flight {number}")
+        return self.case_with(number, {})
+
+    def case_with(self, number: int, changes: Mapping[str, Value]) -> Case:
+        """A flight with other values of some variables, its noise and gusts the same. Raises InputError."""
+        values = {**self.values(number), **changes}
+        return _case(self, values, self.flight_seed(number), f"{self.source}: flight {number}")
 
     def to_json(self) -> str:
         """All of it as text, for workers and for the folder: `from_json` makes the same study of it."""
@@ -169,8 +174,13 @@ class Study:
         return hashlib.sha256(json.dumps(self._whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def load_study(name: str, changes: Mapping[str, Any] | None = None) -> Study:
-    """The study file of that name or path; `changes` replace keys of it (options of the command line).
+def load_study(name: str, changes: Mapping[str, Any] | None = None, vehicle: str | None = None) -> Study:
+    """The study file of that name or path.
+
+    Args:
+        name: path or bundled name.
+        changes: replace keys of it (options of the command line).
+        vehicle: flies in the place of the flight's.
 
     Raises:
         InputError: naming file, key path, value and what is allowed.
@@ -179,7 +189,7 @@ def load_study(name: str, changes: Mapping[str, Any] | None = None) -> Study:
     data = {**read_toml(path), **(changes or {})}
     file = validate(StudyFile, data, str(path))
     flight_name = _beside(file.flight, path)
-    flight = embedded(load_flight(flight_name))
+    flight = embedded(load_flight(flight_name, _with_vehicle(vehicle)))
     tables = {name: _table_of(flight, name, str(path)) for name in _trajectory_names(file, str(path))}
     return _study(str(path), data, json.loads(flight.model_dump_json(exclude_none=True)), file, flight, tables)
 
@@ -215,6 +225,13 @@ def _trajectory_names(file: StudyFile, source: str) -> list[str]:
     if wrong is not None:
         raise InputError(f"{source}: vary.trajectory.name: {wrong}")
     return [str(name) for name in (spread.choice if spread.choice is not None else (spread.constant,))]
+
+
+def _with_vehicle(name: str | None) -> Callable[[dict[str, Any]], None] | None:
+    if name is None:
+        return None
+    contents = read_toml(find(name, "vehicles"))
+    return lambda data: data.update(vehicle=contents)
 
 
 def _beside(name: str, study: Path) -> str:

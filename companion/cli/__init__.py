@@ -29,6 +29,7 @@ COMMANDS = {
     "simulate": "Compute a flight without sockets, for a quick look at gains.",
     "certify": "Check a gain set: certificate, margins, predicted extremes.",
     "campaign": "Fly thousands of simulated flights of a study, or one of them again.",
+    "tune": "Search certified gains for a vehicle and a set of disturbances.",
     "upload": "Bring a trajectory to the vehicle and get its verdict.",
     "list": "Show the trajectories on the vehicle.",
     "remove": "Remove a trajectory from the vehicle.",

@@ -42,6 +42,9 @@ def run(
     workers: Annotated[
         int | None, typer.Option("--workers", metavar="N", min=1, help="Processes; default one per core.")
     ] = None,
+    guarded: Annotated[
+        bool, typer.Option("--guarded/--unguarded", help="With replay: as it would fly, or past gates and guards.")
+    ] = True,
     mavlink: Annotated[
         bool, typer.Option("--mavlink/--no-mavlink", help="With replay: fly it over MAVLink as well.")
     ] = True,
@@ -53,7 +56,7 @@ def run(
         from companion.cli.campaign_replay import replay
 
         folder, number = _flight_of(what[1:])
-        raise typer.Exit(replay(folder, number, out, mavlink=mavlink, engine=engine, as_json=as_json))
+        raise typer.Exit(replay(folder, number, out, mavlink=mavlink, guarded=guarded, engine=engine, as_json=as_json))
     if len(what) != 1:
         raise InputError(f"one study at a time; {' '.join(what[1:])!r} is too much (see `companion campaign --help`)")
     if scheduler is not None and scheduler != "local" and workers is not None:

@@ -1,0 +1,69 @@
+"""Gains are searched among those that a flight would be allowed with, and the choice is explained."""
+
+import math
+
+import pytest
+
+from companion.campaign import tune
+from companion.campaign.study import load_study
+from companion.control.certificate import certify, disturbance_overcome
+from companion.control.law import Gains
+from companion.errors import RefusedError
+from tests.unit.campaign_cases import tiny, tiny_file
+
+OWN = {"k1_1_s": 2.0, "k2": 3.0, "k3_1_s": 3.0, "k4_1_s": 4.0, "gamma_1_s3": 4.0, "position_error_max_m": 0.75}
+WISH = tune.Wish(0.01, 1, 0.3)
+
+
+def test_p_max_is_what_the_largest_disturbance_asks_for(tmp_path):
+    vehicle = load_study("robustness").flight.vehicle
+    gains = tune.complete(vehicle, [2.0, 3.0, 3.0, 4.0, 4.0])
+    sound = Gains(2.0, 3.0, 3.0, 4.0, 4.0, gains["position_error_max_m"], 1, 1.0, 1.0, 1.0)
+    assert 1.0 < disturbance_overcome(sound) / vehicle.limits.disturbance_max_m_s2 < 1.06
+    assert gains | {"position_error_max_m": 0.0} == OWN | {"position_error_max_m": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "margin_s", "says"),
+    [
+        ({"gamma_1_s3": 60.0}, 0.01, "not certified: the smallest eigenvalue of Q"),
+        ({}, 0.15, "150 ms are asked for"),
+        ({"k3_1_s": 60.0, "k4_1_s": 60.0}, 0.01, "a delay margin of"),
+    ],
+)
+def test_what_no_flight_would_be_allowed_with_is_not_flown(changes, margin_s, says, tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "fly", lambda *_: pytest.fail("it was flown"))
+    found = tune.score(tiny(tmp_path).to_json(), OWN | changes, WISH._replace(delay_margin_s=margin_s), 0, "python")
+    assert says in found.unfit and found.cost > tune.UNFIT * 0.99 and found.converged == 0
+
+
+def test_better_tracking_costs_less_and_a_lost_flight_more(tmp_path):
+    text = tiny(tmp_path, duration_s=8.0, more="[converged]\nstatistics_after_s = 0.0\n").to_json()
+    good = tune.score(text, OWN, WISH, 0, "auto")
+    assert (good.unfit, good.converged) == ("", 1) and 0.0 < good.rms_m < 0.2
+    lost = tiny(tmp_path, duration_s=8.0, more="thrust_factor = { constant = 0.55 }\n").to_json()
+    assert tune.score(lost, OWN, WISH, 0, "auto").cost > good.cost + tune.LOST
+
+
+def test_the_search_chooses_explains_and_compares(tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "POPULATION", 1)
+    more = "[vary.controller]\nk1_1_s = { uniform = [1.9, 2.0] }\n[converged]\nstatistics_after_s = 0.0\n"
+    study = tiny(tmp_path, count=4, duration_s=0.2, more=more)
+    seen = []
+    tuned = tune.tune(study, WISH, "python", generations=1, workers=1, progress=lambda *x: seen.append(x))
+    vehicle = study.flight.vehicle.model_copy(
+        update={"controller": study.flight.vehicle.controller.model_copy(update=tuned.gains)}
+    )
+    parameters = vehicle.parameters()
+    assert certify(parameters.gains, parameters.model.drag).failure() is None
+    assert 1.9 <= tuned.gains["k1_1_s"] <= 2.0 and tuned.search.delay_margin_s >= 0.01 and not tuned.search.unfit
+    assert seen[-1][0] == tuned.evaluations >= 10 and math.isfinite(seen[-1][1].cost)
+    said = tune.words(tuned, WISH)
+    assert said[0].startswith("Certified") and sum("a quarter higher" in s for s in said) == 5
+
+
+def test_it_is_refused_when_nothing_is_allowed(tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "POPULATION", 1)
+    path = tiny_file(tmp_path, more="[vary.controller]\ngamma_1_s3 = { uniform = [900.0, 1000.0] }\n")
+    with pytest.raises(RefusedError, match=r"no gain set of \d+ is allowed.*: ask for less margin"):
+        tune.tune(load_study(str(path)), WISH, "python", generations=1, workers=1)
