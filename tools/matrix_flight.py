@@ -102,7 +102,9 @@ class Stage:
         seed: of noise and faults.
         happenings: what goes wrong.
         engine: of the vehicle's physics and the law.
-        vehicle_changes: `VehicleOptions` beyond the usual.
+        compiled: the law's kernels, where they are there already.
+        parameters: of the autopilot, beyond the usual.
+        start: where the vehicle waits in the air, position NED [m] and yaw [rad]; None: on the ground.
     """
 
     def __init__(
@@ -115,6 +117,7 @@ class Stage:
         engine: str = "auto",
         compiled: Kernels | None = None,
         parameters: dict[str, int | float] | None = None,
+        start: tuple[Vec3, float] | None = None,
     ) -> None:
         self.flight = flight
         path = folder / "vehicle.toml"
@@ -125,6 +128,7 @@ class Stage:
             VehicleOptions(
                 vehicle=load(str(path)),
                 world=world,
+                start=start,
                 seed=seed,
                 engine=engine,
                 parameters=PARAMETERS | (parameters or {}),

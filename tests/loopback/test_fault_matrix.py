@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from matrix_cases import CASES, PHASES, Job, pairs, singles
 from matrix_flight import FENCE_RADIUS_M, Moment, flight_of, fly
 from matrix_judge import judge, judged
