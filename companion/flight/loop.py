@@ -132,6 +132,7 @@ class FlightLoop:
         connection: what to call the link in explanations.
         system: the vehicle's system id, where it is known already.
         host: the program around it.
+        paced: called once when it is known that the vehicle waits for us (lockstep).
         engaged: called when the controller takes over, and again after its course's pace was changed; must not block.
         only_gates: nothing is flown: it ends when the gates have judged.
     """
@@ -151,6 +152,7 @@ class FlightLoop:
         host: Host | None = None,
         engaged: Callable[[Engagement], None] = lambda engagement: None,
         only_gates: bool = False,
+        paced: Callable[[], None] = lambda: None,
     ) -> None:
         self._flight = flight
         self._trajectory = trajectory
@@ -164,6 +166,7 @@ class FlightLoop:
         self._host: Host = Alone() if host is None else host
         self._engaged = engaged
         self._only_gates = only_gates
+        self._paced = paced
         self._autopilot = Autopilot()
         self._tracker = controller_of(flight, compiled, self._autopilot, notify)
         self._retuning = Retuning(self._tracker, notify) if isinstance(self._tracker, Tracker) else None
@@ -335,6 +338,7 @@ class FlightLoop:
         self._sequence.enter(Phase.CONNECT, now_s, f"heard the autopilot ({peer})")
         self._sequence.enter(Phase.PREFLIGHT, now_s, "asking for rates, version and parameters")
         if self._peer.paced:  # a simulated vehicle on a link of ours alone; elsewhere somebody may need them
+            self._paced()
             for msgid in NOT_NEEDED:
                 self._ops.set_message_interval(msgid, STOP_MESSAGE, now_s)
         return True

@@ -143,6 +143,7 @@ class Ready:
             connection=connection,
             system=system,
             host=host,
+            paced=self.recorder.give_way,
             engaged=lambda engagement: self.recorder.state("engagement", json.dumps(asdict(engagement))),
         )
 

@@ -52,6 +52,11 @@ class _Lane:
         self._waiting.append(request)
         self.update(now_s)
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is in the air or waits."""
+        return self._current is None and not self._waiting
+
     def find(self, params: Params) -> Operation | None:
         """The request in the air, if it asks for exactly this."""
         current = self._current
@@ -137,6 +142,8 @@ class CommandQueue:
     def __init__(self, send: SendCommand) -> None:
         self._send = send
         self._lanes: dict[int, _Lane] = {}
+        self._busy: dict[int, _Lane] = {}
+        """Lanes with something to do: `update` comes with every state, and most commands are asked once."""
 
     def ask(self, command: int, params: Params, operation: Operation, retry: Retry, newest_wins: bool) -> Operation:
         """Ask for a command, from `operation.asked_s` on.
@@ -153,7 +160,7 @@ class CommandQueue:
         Returns:
             The operation that stands for the request, `operation` or the one that was there.
         """
-        lane = self._lanes.setdefault(command, _Lane(command, self._send))
+        lane = self._busy[command] = self._lanes.setdefault(command, _Lane(command, self._send))
         request = _Request(operation, params, retry)
         if not newest_wins:
             lane.add(request, operation.asked_s)
@@ -172,5 +179,7 @@ class CommandQueue:
 
     def update(self, now_s: float) -> None:
         """Repeat, give up, go on."""
-        for lane in self._lanes.values():
+        for command, lane in tuple(self._busy.items()):
             lane.update(now_s)
+            if lane.idle:
+                del self._busy[command]

@@ -73,6 +73,8 @@ class ParameterReader:
 
     def update(self, now_s: float) -> None:
         """Repeat, or give up."""
+        if not self._asked:
+            return  # then nothing waits either
         for read in list(self._asked.values()):
             read.due_s = min(read.due_s, now_s + read.retry.interval_s)  # should the caller's clock have been set back
             if now_s < read.due_s:

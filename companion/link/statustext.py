@@ -68,6 +68,8 @@ class StatusTexts:
 
     def update(self, now_s: float) -> None:
         """Give up on chunks that did not come."""
+        if not self._partial:
+            return
         late = [key for key, partial in self._partial.items() if not 0.0 <= now_s - partial.started_s <= CHUNKS_WAIT_S]
         for key in late:
             self._finish(key, now_s)

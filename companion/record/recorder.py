@@ -142,7 +142,12 @@ class Recorder:
         """Hand over what is known under a key from now on, for the log. Never blocks; the last one of a key counts."""
         self.offer(Entry.FACT, f"{key}\0{fact}".encode("utf-8", "replace"), 0)
 
-    def close(self, timeout_s: float = 10.0) -> None:
+    def give_way(self) -> None:
+        """The vehicle is in lockstep: the logs are written when the ring is half full and at the end, so that the child
+        leaves the processors to the two processes that wait for each other."""
+        self._writer.be_patient()
+
+    def close(self, timeout_s: float = 30.0) -> None:
         """End the logs: the child writes what it has and ends. Waits for `timeout_s` at most; again does nothing."""
         if self._closed:
             return
@@ -330,7 +335,8 @@ def _receive(link: socket.socket, reader: RingReader, traffic: _TrafficFile, fli
         flight.refused(reader.refused)
 
     while not select.select([link], [], [], _ROUND_S)[0]:
-        write(reader.take())
+        if not reader.may_wait:
+            write(reader.take())
     write(reader.take_rest())
     flight.end()
 

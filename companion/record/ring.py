@@ -27,7 +27,7 @@ _PACK: Final = tuple(struct.Struct(f"{_ENTRY.format}{length}s").pack_into for le
 _SKIP: Final = 0xFFFFFFFF
 """A length that says: the next entry is at the beginning again."""
 _HEAD_BYTES: Final = 64
-_WRITTEN, _READ, _TAKEN, _REFUSED = 0, 1, 2, 3  # the head's numbers, of 8 bytes each
+_WRITTEN, _READ, _TAKEN, _REFUSED, _PATIENT = 0, 1, 2, 3, 4  # the head's numbers, of 8 bytes each
 
 
 class Entry(NamedTuple):
@@ -125,6 +125,10 @@ class RingWriter(_Ring):
         self._until = min(self._size, self._at + free)
         return True
 
+    def be_patient(self) -> None:
+        """Let the reader wait until the ring is half full: its work would take the processor from who writes."""
+        self._numbers[_PATIENT] = 1
+
     def close(self) -> None:
         """Refuse what still comes, and count it: nobody reads any more."""
         self._closed = True
@@ -149,6 +153,12 @@ class RingReader(_Ring):
         super().__init__(descriptor)
         self._done = 0
         self._seen = 0
+
+    @property
+    def may_wait(self) -> bool:
+        """Whether the writer wants its processor for itself, and there is room enough for that."""
+        numbers = self._numbers
+        return bool(numbers[_PATIENT]) and 2 * (numbers[_WRITTEN] - numbers[_READ]) < self._size
 
     def take(self) -> Iterator[Entry]:
         """The entries that were there at the last look already."""

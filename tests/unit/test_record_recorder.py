@@ -99,6 +99,17 @@ def test_entries_reach_the_file_during_the_flight(tmp_path, recorder):
     assert until(lambda: len(list(read_tlog(tmp_path / "link.tlog"))) == 1)
 
 
+def test_one_that_gives_way_writes_everything_at_the_end(tmp_path, recorder):
+    recorder.give_way()
+    for index in range(50):
+        recorder.offer(Direction.IN, frame(index), time.monotonic_ns())
+    time.sleep(0.3)  # it looks twenty times per second
+    assert recorder.behind == 50
+    recorder.close()
+    assert (recorder.recorded, recorder.dropped, recorder.problem) == (50, 0, None)
+    assert len(list(read_tlog(tmp_path / "link.tlog"))) == 50
+
+
 def test_signals_that_end_a_command_do_not_end_the_recorder(tmp_path, recorder):
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         recorder._process.send_signal(number)

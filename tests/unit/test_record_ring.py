@@ -76,3 +76,18 @@ def test_entries_of_any_size_keep_their_content():
         content = (bytes(range(256)) * 20)[:length]
         assert writer.put(7, content, -5)
         assert list(reader.take_rest()) == [Entry(-5, 7, content)]
+
+
+def test_a_patient_writer_lets_the_reader_wait_until_the_ring_is_half_full():
+    writer, reader = make(230)
+    assert writer.put(0, b"0123456789", 0)
+    assert not reader.may_wait  # nobody said so
+    writer.be_patient()
+    assert reader.may_wait
+    for _ in range(3):
+        assert reader.may_wait
+        assert writer.put(0, b"0123456789", 0)  # 23 bytes each
+    assert writer.put(0, b"0123456789", 0)  # half of it
+    assert not reader.may_wait
+    assert len(list(reader.take_rest())) == 5
+    assert reader.may_wait
