@@ -43,6 +43,14 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON documen
 EngineOption = Annotated[
     str, typer.Option("--engine", help='"auto", "python" or "numba" (needs the extra [fast]); same numbers.')
 ]
+RealtimeOption = Annotated[
+    bool,
+    typer.Option(
+        "--realtime",
+        help="Ask the system for a real-time scheduling class, locked memory, exact timers and a core of its own"
+        " choice; what is not permitted is said.",
+    ),
+]
 VehicleOption = Annotated[
     str | None, typer.Option("--vehicle", metavar="NAME", help="Vehicle file, or the name of a bundled one.")
 ]
@@ -173,6 +181,7 @@ def fly_bundled(
     quiet: bool,
     display: Display,
     key: str | None = None,
+    realtime: bool = False,
 ) -> Flown:
     """Starts the bundled vehicle, flies it, and ends it; with a key both sign.
 
@@ -192,7 +201,7 @@ def fly_bundled(
             if "flown" in message:  # it would wait for a companion that has gone
                 bundled.stop()
 
-        return control(folder, VehicleLink(bundled.connection, key), engine, timeout_s, listen)
+        return control(folder, VehicleLink(bundled.connection, key), engine, timeout_s, listen, realtime=realtime)
 
 
 def fault_file(name: str | None) -> Path | None:

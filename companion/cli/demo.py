@@ -15,6 +15,7 @@ from companion.cli.common import (
     JsonOption,
     LiveOption,
     OutOption,
+    RealtimeOption,
     RerunFileOption,
     RerunOption,
     TimeScaleOption,
@@ -59,6 +60,7 @@ def run(
     real_time: Annotated[bool, typer.Option("--real-time", help="Fly at real time instead of in lockstep.")] = False,
     out: OutOption = None,
     engine: EngineOption = "auto",
+    realtime: RealtimeOption = False,
     live: LiveOption = False,
     rerun: RerunOption = False,
     rerun_file: RerunFileOption = None,
@@ -103,6 +105,7 @@ def run(
             timeout_s=CONNECT_TIMEOUT_S,
             quiet=as_json,
             display=display,
+            realtime=realtime,
             key=key,
         )
     raise typer.Exit(report_flight(flown, as_json=as_json))

@@ -20,6 +20,7 @@ from companion.cli.common import (
     JsonOption,
     LiveOption,
     OutOption,
+    RealtimeOption,
     RerunFileOption,
     RerunOption,
     TimeScaleOption,
@@ -71,6 +72,7 @@ def run(
     timeout: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for the vehicle.")] = 15.0,
     out: OutOption = None,
     engine: EngineOption = "auto",
+    realtime: RealtimeOption = False,
     live: LiveOption = False,
     rerun: RerunOption = False,
     rerun_file: RerunFileOption = None,
@@ -127,9 +129,10 @@ def run(
                 timeout_s=timeout,
                 quiet=as_json,
                 display=display,
+                realtime=realtime,
                 key=key,
             )
         else:
             say(f"{configured.name}: {name} on {configured.vehicle.name}, listening on {connection}", quiet=as_json)
-            flown = control(folder, link, engine, timeout, display)
+            flown = control(folder, link, engine, timeout, display, realtime=realtime)
     raise typer.Exit(report_flight(flown, as_json=as_json))

@@ -18,6 +18,7 @@ from companion.cli.common import (
     ControllerOption,
     EngineOption,
     JsonOption,
+    RealtimeOption,
     VehicleKeyOption,
     VehicleSystemOption,
     controller_changes,
@@ -81,6 +82,7 @@ def run(
         bool, typer.Option("--reports/--no-reports", help="Build report.html after every flight, at a low priority.")
     ] = True,
     engine: EngineOption = "auto",
+    realtime: RealtimeOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Waits for commands and flies, until it is stopped."""
@@ -104,6 +106,7 @@ def run(
         trajectories=str(_usable(folder, "--folder")),
         flights=str(_usable(flights, "--flights")),
         engine=engine,
+        realtime=realtime,
         reports=reports,
         key=None if key is None else str(Path(key).absolute()),
         system=system,

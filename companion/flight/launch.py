@@ -87,7 +87,9 @@ def _identity(flight: Flight) -> str | None:
     return sha256(flight.model_dump_json().encode()).hexdigest()
 
 
-def control(folder: Path, link: VehicleLink | str, engine: str, timeout_s: float, listen: Listener) -> Flown:
+def control(
+    folder: Path, link: VehicleLink | str, engine: str, timeout_s: float, listen: Listener, *, realtime: bool = False
+) -> Flown:
     """Runs the control process and follows its status; SIGINT and SIGTERM are passed on to it.
 
     Args:
@@ -97,6 +99,7 @@ def control(folder: Path, link: VehicleLink | str, engine: str, timeout_s: float
         timeout_s: how long to wait for a vehicle.
         listen: gets every status message: {"line"}, {"progress"}, {"ready"}, {"flown"}, {"error"} or {"outcome"}. One
             that raises is not called again: a broken display does not end a flight.
+        realtime: ask the system for what `companion.realtime` names.
 
     Raises:
         CompanionError: the control process could not begin.
@@ -109,6 +112,7 @@ def control(folder: Path, link: VehicleLink | str, engine: str, timeout_s: float
                 [
                     *(sys.executable, "-m", "companion.flight.process"),
                     *(str(folder), link.as_json(), engine, str(timeout_s), str(theirs.fileno())),
+                    *(("realtime",) if realtime else ()),
                 ],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,

@@ -29,6 +29,7 @@ from companion.flight.tracker import Kernels, kernels
 from companion.link.framing import refused_since
 from companion.link.vehicle_link import VehicleLink
 from companion.link.wire import Wire
+from companion.realtime import prepare
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, write_summary
 from companion.record.recorder import Recorder
@@ -170,9 +171,20 @@ class Ready:
         return _finish(self.folder, self.flight, self.trajectory, self.record, outcome, status)
 
 
-def fly(folder: Path, link: VehicleLink, engine: str, timeout_s: float, status: Status, signals: Signals) -> int:
+def fly(
+    folder: Path,
+    link: VehicleLink,
+    engine: str,
+    timeout_s: float,
+    status: Status,
+    signals: Signals,
+    *,
+    realtime: bool = False,
+) -> int:
     """Flies the flight of a folder and writes record and summary into it. Returns the exit code."""
     ready = Ready.made(folder, engine, status.line)
+    if realtime:
+        ask_the_system(status.line)
     outcome = None
     connection = link.connection
     try:
@@ -187,6 +199,12 @@ def fly(folder: Path, link: VehicleLink, engine: str, timeout_s: float, status: 
     finally:
         code = ready.close(status, outcome)
     return code
+
+
+def ask_the_system(line: Callable[[str], None]) -> None:
+    """`--realtime`, with a line for people about each of its parts."""
+    for measure in prepare():
+        line(measure.sentence)
 
 
 def warm_up(flight: Any, compiled: Any) -> None:
@@ -245,11 +263,14 @@ def _written(folder: Path, record: FlightRecord, summary: dict[str, Any], status
 
 
 def main() -> int:
-    """Arguments: folder, vehicle link (JSON), engine, connect timeout [s], file descriptor of the status channel."""
-    folder, link, engine, timeout, descriptor = sys.argv[1:]
+    """Arguments: folder, vehicle link (JSON), engine, connect timeout [s], file descriptor of the status channel, and
+    "realtime" where that is wanted."""
+    folder, link, engine, timeout, descriptor, *more = sys.argv[1:]
+    realtime = more == ["realtime"]
     status = Status(socket.socket(fileno=int(descriptor)))
     try:
-        return fly(Path(folder), VehicleLink.from_json(link), engine, float(timeout), status, Signals())
+        signals, vehicle = Signals(), VehicleLink.from_json(link)
+        return fly(Path(folder), vehicle, engine, float(timeout), status, signals, realtime=realtime)
     except CompanionError as error:
         status.send(error=str(error))
         return int(error.exit_code)

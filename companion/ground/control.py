@@ -24,7 +24,7 @@ from companion.errors import CompanionError, ExitCode, InputError, LinkError
 from companion.flight.connect import AUTOPILOT_COMPONENT
 from companion.flight.loop import FlightLoop, Progress
 from companion.flight.phases import Cause, Order, Phase
-from companion.flight.process import Status, warm_up
+from companion.flight.process import Status, ask_the_system, warm_up
 from companion.flight.retuning import ParameterChange
 from companion.flight.tracker import kernels
 from companion.ground.channel import Channel, Copy, Outgoing
@@ -97,6 +97,8 @@ class Control:
             InputError, LinkError: the vehicle link cannot be had, or is gone.
         """
         self._warm_up()
+        if self._settings.realtime:
+            ask_the_system(self._say)
         with self._settings.link.open(self._tap) as wire:
             self._wire = wire
             self._standby = Standby(wire, self.on_frame, self._say)

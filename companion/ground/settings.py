@@ -27,6 +27,8 @@ class Settings:
     """Folder that gets a folder per flight."""
     engine: str
     """"auto", "python" or "numba"."""
+    realtime: bool = False
+    """Whether the control process asks the system for what `companion.realtime` names."""
     reports: bool = True
     """Whether a flight's report.html is built when the flight is over."""
     flight: dict[str, Any] = field(default_factory=dict)

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import CompanionError, InputError
+from companion.realtime import rejoin
 from companion.record import ring
 from companion.record.flight_log import Entry, FlightLog, Level
 from companion.record.ring import RingReader, RingWriter
@@ -357,6 +358,7 @@ def main(arguments: list[str]) -> int:
         return 2
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    rejoin()
     _lower_priority()
     pair, tlog, log, memory, epoch_minus_wall_ns = map(int, arguments[:5])
     reader = RingReader(memory)

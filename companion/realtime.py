@@ -1,0 +1,120 @@
+"""What the system can do for the control process (`--realtime`), each on its own and each said: a scheduling class
+above everything ordinary, memory that is not swapped out, timers without slack, a core to stay on.
+
+Nothing of it is needed for a flight; on an idle machine it changes little, on a busy one the step's 99th percentile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import resource
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple
+
+PRIORITY: Final = 20
+"""Of SCHED_FIFO, 1 to 99: above all ordinary processes, below the kernel's own threads (50)."""
+CORES_VARIABLE: Final = "COMPANION_CORES"
+"""Tells children on which cores this process might run before it chose one."""
+
+_PR_SET_TIMERSLACK: Final = 29
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_CAP_IPC_LOCK: Final = 14
+
+
+class Measure(NamedTuple):
+    """One thing that was asked of the system."""
+
+    name: str
+    taken: bool
+    detail: str
+    """What holds now, or why not and what to do about it."""
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        return f"realtime: {self.name}: {self.detail}"
+
+
+def prepare() -> list[Measure]:
+    """Asks for all of it, for the calling thread and the memory of its process; never raises.
+
+    Call it when all that is to run beside the control loop (the recorder) has been started: children do not get the
+    scheduling class, and `rejoin` gives them the cores back.
+    """
+    measures = (("cores", _stay_on_a_core), ("timer slack", _no_slack), ("memory", _lock_memory))
+    return [_taken(name, ask) for name, ask in (*measures, ("scheduling class", _fifo))]
+
+
+def rejoin() -> None:
+    """For a process that a real-time one started: it may run on all cores again."""
+    cores = os.environ.pop(CORES_VARIABLE, "")
+    with contextlib.suppress(OSError, ValueError):
+        os.sched_setaffinity(0, {int(core) for core in cores.split(",")})
+
+
+class _NotPermittedError(Exception):
+    """Why one of them is not to be had."""
+
+
+def _taken(name: str, ask: Callable[[], str]) -> Measure:
+    try:
+        return Measure(name, True, ask())
+    except _NotPermittedError as error:
+        return Measure(name, False, f"not permitted: {error}")
+    except (OSError, AttributeError) as error:  # not Linux, or a system that lacks it
+        return Measure(name, False, f"not available here: {error}")
+
+
+def _fifo() -> str:
+    try:
+        # Children start in the ordinary class: a recorder or a planner there would compete with the loop itself.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+    except PermissionError:
+        raise _NotPermittedError(
+            f"it needs CAP_SYS_NICE or an rtprio limit of {PRIORITY} (ulimit -r, LimitRTPRIO={PRIORITY} in a unit)"
+        ) from None
+    return f"SCHED_FIFO, priority {PRIORITY}"
+
+
+def _lock_memory() -> str:
+    needs = _NotPermittedError(
+        "it needs CAP_IPC_LOCK or no memlock limit (ulimit -l unlimited, LimitMEMLOCK=infinity in a unit)"
+    )
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    # Under a limit the lock may be granted now and an allocation in flight fail: then rather none.
+    if soft != resource.RLIM_INFINITY and not _capable(_CAP_IPC_LOCK):
+        raise needs
+    if _libc().mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+        raise needs
+    return "locked, what is there and what comes"
+
+
+def _no_slack() -> str:
+    if _libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0) != 0:
+        raise _NotPermittedError(os.strerror(ctypes.get_errno()))
+    return "1 ns instead of 50 us"
+
+
+def _stay_on_a_core() -> str:
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < 2:
+        raise _NotPermittedError("there is one core only, nothing to choose")
+    os.sched_setaffinity(0, {cores[-1]})  # interrupts are mostly served by the first
+    os.environ[CORES_VARIABLE] = ",".join(map(str, cores))
+    return f"stays on {cores[-1]} of {len(cores)}"
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def _capable(capability: int) -> bool:
+    """Whether this process has a capability, by its number."""
+    with contextlib.suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        effective = next(line.split()[1] for line in lines if line.startswith("CapEff"))
+        return bool(int(effective, 16) >> capability & 1)
+    return False

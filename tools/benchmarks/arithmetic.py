@@ -1,0 +1,227 @@
+"""The control step and the physics step against RotorPy's, in turn; how cost grows; instruction counts.
+
+RotorPy runs in its own process, with its own Python (`--rotorpy-python`); both sides time their calls themselves.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from companion import accelerate
+from companion.config import find, load_flight
+from companion.control.types import State
+from companion.flight.course import Course
+from companion.flight.tracker import Tracker, kernels
+from companion.trajectory.load import load
+from sim_link import vehicle_file
+from sim_link.airframe import Airframe
+from sim_link.inner_loops import RATES, Setpoint
+from sim_link.wind import World
+
+from .common import PYTHON, NotHereError, Row, Setting, median, module_environment, p50_p99, times_us, verdict
+
+ROUNDS, CALLS = 15, 200
+HOW_TO_GET_ROTORPY = "RotorPy is not importable: install it somewhere and name that Python with --rotorpy-python"
+
+
+class RotorPy:
+    """RotorPy in its process."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+        if self._answer() != "ready":
+            raise NotHereError(HOW_TO_GET_ROTORPY)
+
+    def _answer(self) -> object:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        return json.loads(line) if line else None
+
+    def ask(self, kind: str, count: int) -> list[float]:
+        """The durations of so many calls."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{kind} {count}\n")
+        self._process.stdin.flush()
+        answer = self._answer()
+        if not isinstance(answer, list):
+            raise NotHereError("RotorPy ended without an answer")
+        return answer
+
+
+@contextlib.contextmanager
+def rotorpy(setting: Setting) -> Iterator[RotorPy]:
+    """RotorPy, ready.
+
+    Raises:
+        NotHereError: it cannot be imported there.
+    """
+    worker = Path(__file__).with_name("rotorpy_worker.py")
+    one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    try:
+        process = subprocess.Popen(
+            [setting.rotorpy_python, str(worker)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env={**os.environ, **one_thread},
+        )
+    except OSError as error:
+        raise NotHereError(f"--rotorpy-python {setting.rotorpy_python}: {error.strerror}") from None
+    try:
+        yield RotorPy(process)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def control_step(engine: str) -> Callable[[int], object]:
+    """The control step as the loop calls it: history, prediction, reference, law, conversion into a setpoint."""
+    vehicle = load_flight("paper").vehicle
+    course = Course(load("paper"), vehicle, (0.0, 0.0, -10.0), 0.0, None)
+    state = State((0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1))
+    tracker = Tracker(vehicle, "rates", kernels(engine))
+    tracker.begin(state)
+    return lambda i: tracker.step(1.0 + 0.004 * i, state, course.at)
+
+
+def physics_steps(engine: str, count: int) -> Callable[[int], object]:
+    """So many physics steps of the bundled vehicle with its inner loops, as the simulated vehicle runs them."""
+    vehicle = vehicle_file.load(str(find("bundled", "vehicles")))
+    airframe = Airframe(vehicle, World(force_n=(0.5, 0.0, 0.0)), seed=1, engine=engine, start=((0.0, 0.0, -10.0), 0.0))
+    setpoint = Setpoint(RATES, 0.5, (0.01, 0.0, 0.02), (1.0, 0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0))
+    return lambda _: airframe.advance(setpoint, True, count)
+
+
+def engines() -> list[str]:
+    return ["python", *(["numba"] if accelerate.available() else [])]
+
+
+def control_rows(setting: Setting) -> list[Row]:
+    """The control step against SE3Control.update."""
+    calls = {engine: control_step(engine) for engine in engines()}
+    for call in calls.values():
+        times_us(call, 300)
+    ours: dict[str, list[float]] = {engine: [] for engine in calls}
+    theirs: list[float] = []
+    with rotorpy(setting) as other:
+        other.ask("controller", 100)
+        for i in range(3 if setting.quick else ROUNDS):
+            setting.say(f"control step, round {i + 1}")
+            theirs += other.ask("controller", CALLS)
+            for engine, call in calls.items():
+                ours[engine] += times_us(call, CALLS, 300 + i * CALLS)
+    a, b = p50_p99(theirs)
+    rows = []
+    for engine, reach in (("python", 10.0), ("numba", 80.0)):
+        if engine not in ours:
+            continue
+        p50, p99 = p50_p99(ours[engine])
+        seen = f"{p50:.1f} / {p99:.1f} us: {a / p50:.1f} / {b / p99:.1f} times faster"
+        against = f"RotorPy SE3Control.update, p50 / p99 {a:.0f} / {b:.0f} us"
+        what = f"control step as the loop calls it, {engine}"
+        rows.append(Row(what, against, f">= {reach:.0f} times faster", seen, verdict(a / p50 >= reach)))
+    return rows
+
+
+def physics_rows(setting: Setting) -> list[Row]:
+    """The physics step against Multirotor.step; ours come 20 at a time, as a state at 50 Hz asks for them."""
+    per_call = 20
+    theirs: list[float] = []
+    calls = {engine: physics_steps(engine, per_call) for engine in engines()}
+    for call in calls.values():
+        times_us(call, 50)
+    ours: dict[str, list[float]] = {engine: [] for engine in calls}
+    with rotorpy(setting) as other:
+        other.ask("vehicle", 20)
+        for i in range(3 if setting.quick else ROUNDS):
+            setting.say(f"physics step, round {i + 1}")
+            theirs += other.ask("vehicle", CALLS // 2)
+            for engine, call in calls.items():
+                ours[engine] += [t / per_call for t in times_us(call, CALLS // 2)]
+    a, b = p50_p99(theirs)
+    rows = []
+    for engine in calls:
+        p50, p99 = p50_p99(ours[engine])
+        reach = ">= 500 times faster" if engine == "numba" else ""
+        rows.append(
+            Row(
+                f"physics step of the bundled vehicle with its inner loops, {engine}",
+                f"RotorPy Multirotor.step, p50 / p99 {a:.0f} / {b:.0f} us",
+                reach,
+                f"{p50:.2f} / {p99:.2f} us: {a / p50:.0f} / {b / p99:.0f} times faster",
+                verdict(a / p50 >= 500.0) if reach else "",
+            )
+        )
+    rows[-1].notes.append("Physics: a call runs 20 steps of 2 ms, rotors, rate loop and drag among them.")
+    return rows
+
+
+def instruction_rows(setting: Setting) -> list[Row]:
+    """Instructions per control step, counted by callgrind: they do not depend on what else the machine does."""
+    if shutil.which("valgrind") is None:
+        raise NotHereError("needs valgrind")
+    rows = []
+    for engine in engines():
+        counts = []
+        for steps in (200, 700):
+            setting.say(f"instructions of {steps} control steps, {engine}")
+            command = [
+                "valgrind",
+                "--tool=callgrind",
+                f"--callgrind-out-file={setting.folder / 'callgrind.out'}",
+                PYTHON,
+            ]
+            command += ["-m", "benchmarks.arithmetic", engine, str(steps)]
+            environment = {**module_environment(), "PYTHONHASHSEED": "0"}
+            done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280, check=False)
+            found = re.search(r"Collected : (\d+)", done.stderr)
+            if found is None:
+                raise NotHereError(f"callgrind counted nothing: {done.stderr.strip()[-200:]}")
+            counts.append(int(found.group(1)))
+        per_step = (counts[1] - counts[0]) / 500
+        rows.append(Row(f"instructions per control step, {engine}", "", "", f"{per_step:,.0f}", ""))
+    return rows
+
+
+def growth_rows(setting: Setting) -> list[Row]:
+    """Cost over the number of vehicles and over the time flown: a share of 1 is linear."""
+    engine = engines()[-1]
+    per_vehicle, per_second = [], []
+    for count in (1, 4, 16):
+        setting.say(f"growth: {count} vehicles")
+        calls = [physics_steps(engine, 4) for _ in range(count)]
+        steps = [control_step(engine) for _ in range(count)]
+        for i in range(20):
+            for call, step in zip(calls, steps, strict=True):
+                call(i), step(i)
+        one_round = times_us(
+            lambda i, c=calls, s=steps: [(call(i), step(i)) for call, step in zip(c, s, strict=True)],  # type: ignore[misc]
+            60 if setting.quick else 400,
+            20,
+        )
+        per_vehicle.append(median(one_round) / count)
+    step = control_step(engine)
+    for begin in range(0, 40_000, 10_000):
+        per_second.append(median(times_us(step, 2000 if setting.quick else 10_000, begin)))
+    vehicles = ", ".join(f"{x / per_vehicle[0]:.2f}" for x in per_vehicle)
+    time_flown = ", ".join(f"{x / per_second[0]:.2f}" for x in per_second)
+    return [
+        Row("cost per vehicle and state: 1, 4, 16 vehicles in one process", "1 vehicle", "linear: 1", vehicles, ""),
+        Row("cost per control step: 1st, 2nd, 3rd, 4th 10,000 of a flight", "the 1st", "linear: 1", time_flown, ""),
+    ]
+
+
+if __name__ == "__main__":
+    import sys
+
+    step_of = control_step(sys.argv[1])
+    for index in range(int(sys.argv[2])):
+        step_of(index)
