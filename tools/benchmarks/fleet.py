@@ -8,6 +8,7 @@ import os
 import subprocess
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,10 +21,11 @@ from companion.flight.launch import control, prepare
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.load import embedded
 
-from .common import PYTHON, ROOT, NotHereError, Row, Setting, verdict
+from .common import PYTHON, NotHereError, Row, Setting, running, verdict
 
 COUNT, RATE_HZ = 20, 100.0
 FIRST_PORT = 27540
+START_S = 90.0
 TRAJECTORY = """shape = "circle"
 anchor = "here"
 duration_s = {seconds}
@@ -74,25 +76,27 @@ def fly(seconds: float, setting: Setting) -> Fleet:
     command += ["--start", "0,0,-20", "--port", "0", "--remote-port", str(FIRST_PORT), "--no-ground"]
     command += ["--no-truth-stream", "--json-ready", "--with-parent"]
     engine = "numba" if available() else "python"
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    try:
+    threads = []
+    lines: list[list[Mapping[str, object]]] = [[] for _ in folders]
+    for i, folder in enumerate(folders):
+        arguments = (folder, f"udpin:127.0.0.1:{FIRST_PORT + i}", engine, 120.0, lines[i].append)
+        threads.append(threading.Thread(target=control, args=arguments, daemon=True))
+        threads[-1].start()
+    # Twenty programs that start are no measure of twenty that fly: the vehicles come when all of them listen.
+    begin_s = time.monotonic()
+    while not all(any("ready" in told for told in of) for of in lines):
+        if time.monotonic() - begin_s > START_S:
+            raise NotHereError("not all companions started")
+        time.sleep(0.2)
+    setting.say("all companions listen")
+    with running(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         if not json.loads(process.stdout.readline() or "{}").get("ready"):
             raise NotHereError("the vehicles did not start")
         begin_s, begin_cpu_s = time.monotonic(), _cpu_s(process.pid)
-        threads = []
-        lines: list[list[object]] = [[] for _ in folders]
-        for i, folder in enumerate(folders):
-            link = f"udpin:127.0.0.1:{FIRST_PORT + i}"
-            arguments = (folder, link, engine, 120.0, lines[i].append)
-            threads.append(threading.Thread(target=control, args=arguments, daemon=True))
-            threads[-1].start()
         for thread in threads:
             thread.join(timeout=240.0)
         share = (_cpu_s(process.pid) - begin_cpu_s) / (time.monotonic() - begin_s)
-    finally:
-        process.terminate()
-        process.wait(20.0)
     short = [told[-2:] for folder, told in zip(folders, lines, strict=True) if not _steps(folder)]
     if short:
         raise NotHereError(f"{len(short)} of {COUNT} companions did not fly; one said {short[0]}")
