@@ -11,7 +11,7 @@ PIP_INSTALL := env -u PIP_TARGET -u PIP_PREFIX -u PIP_ROOT -u PIP_REQUIREMENT -u
 unexport PYTHONHOME PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: fuzz audit demo test test-long test-plain lint format clean help
+.PHONY: coverage mutation matrix fuzz audit demo test test-long test-plain lint format clean help
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1: \2/p' Makefile
@@ -48,6 +48,20 @@ test-long: $(VENV)/.test  ## Run the tests that take their time: whole campaigns
 
 test-plain: $(VENV)/.test  ## Run the tests as they run where numba is not installed
 	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest -n 2 --dist loadfile -m "not long"
+
+coverage: $(VENV)/.test  ## Run the tests as plain Python and say how many branches they reach; the programs they start count
+	mkdir -p .coverage && rm -f .coverage/data*
+	-COMPANION_TEST_WITHOUT_NUMBA=1 COVERAGE_PROCESS_START=pyproject.toml \
+	  $(PY) -m coverage run -m pytest -n 2 --dist loadfile -m "not long"
+	$(PY) -m coverage combine -q
+	$(PY) -m coverage report --fail-under=90
+	$(PY) tools/branches.py
+
+mutation: $(VENV)/.test  ## Change the law and the guards in one place at a time: a test must notice; hours
+	$(PY) tools/mutation.py
+
+matrix: $(VENV)/.test  ## Fly the whole fault matrix: an hour or more on two idle cores
+	$(PY) tools/fault_matrix.py singles && $(PY) tools/fault_matrix.py pairs && $(PY) tools/fault_matrix.py real
 
 lint: $(VENV)/.lint  ## Check style, types and import rules
 	$(PY) -m ruff check .

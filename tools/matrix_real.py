@@ -410,7 +410,7 @@ def _fly(scene: Scene, case: RealCase, phase: Phase) -> bool:
     while time.monotonic() - begin_s < PATIENCE_S:
         if serve.over and _calm(vehicle):
             break
-        if _calm(vehicle) and time.monotonic() - begin_s > 12.0 and _rests(vehicle, SETTLE_S):
+        if _calm(vehicle) and time.monotonic() - begin_s > 12.0 and _rests(vehicle, 2.0 * SETTLE_S):
             break
         time.sleep(0.1)
     return acted
