@@ -57,11 +57,14 @@ def find_autopilot(wire: Wire, connection: str, timeout_s: float, interrupted: C
         if speaks_first and (spoken_ns is None or wall_ns - spoken_ns > HEARTBEAT_INTERVAL_NS):
             spoken_ns = wall_ns
             send_heartbeat(wire)
-        for frame in wire.receive(WAIT_S):
+        frames = wire.receive(WAIT_S)
+        for number, frame in enumerate(frames):
             system = None if wire.only_system not in {None, frame.sysid} else autopilot_system(frame)
             if system is not None:
                 wire.system_id = system
                 send_heartbeat(wire)
+                if wire.signed:  # a vehicle in lockstep that was told the time waits for the answer to one of them
+                    wire.keep(frames[:number] + frames[number + 1 :])
                 return system
         if wall_ns - peer_since_ns > PEER_PATIENCE_NS:
             peer_since_ns = wall_ns

@@ -77,6 +77,7 @@ class Wire:
         self._leftover = b""
         self._gathered: list[bytes] | None = None
         self._owned: KeptSigner | None = None
+        self._kept: list[Frame] = []
         self._heard_ns = self._greeted_ns = 0
         self._outdated = 0
         self._poll = select.poll()
@@ -147,6 +148,9 @@ class Wire:
         Raises:
             LinkError: the serial line is gone.
         """
+        if self._kept:
+            kept, self._kept = self._kept, []
+            return kept
         frames: list[Frame] = []
         unknown: list[bytes] = []
         if not self._spin(spin_s, frames, unknown):
@@ -158,6 +162,10 @@ class Wire:
         if self._tap is not None:
             self._report(frames, unknown)
         return frames
+
+    def keep(self, frames: list[Frame]) -> None:
+        """Have frames that were received and not used yet received again, before all others."""
+        self._kept = frames + self._kept
 
     def _read(self, frames: list[Frame], unknown: list[bytes]) -> bool:
         """Use what is there to be read at once; False when there is nothing."""

@@ -39,6 +39,7 @@ class VirtualWire:
     component_id = 191
     last_foreign = None
     only_system = None
+    signed = False
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
