@@ -2,6 +2,7 @@
 
     python tools/fuzz.py                      every target, ten million inputs together
     python tools/fuzz.py --runs 1000000 wire  one target
+    python tools/fuzz.py --blind              changed at random, without looking at coverage: much faster
     python tools/fuzz.py --list
 
 A finding is written to tests/data/fuzz/TARGET/, where tests/unit/test_fuzz.py repeats it from then on. Findings are
@@ -11,11 +12,16 @@ faults, inputs that take longer than 20 s, and memory that grows. Exit code 1: t
 from __future__ import annotations
 
 import argparse
+import random
 import re
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+import traceback
+from hashlib import sha256
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -29,6 +35,23 @@ SHARES = {
 TOGETHER = 10_000_000
 HANG_S = 20
 MEMORY_MB = 900
+GROWTH_MB = 300
+"""With --blind: beyond what the first input needed."""
+TELL_S = 10.0
+ODD = [
+    b"\0",
+    b"\xff",
+    b"\xfd",
+    b"\xfe",
+    b"\0\0\xc0\x7f",
+    b"\0\0\x80\x7f",
+    b"\xff\xff\xff\x7f",
+    b"=",
+    b'"',
+    b"nan",
+    b"[[",
+]
+"""What breaks things: magic bytes, numbers that are none or infinite, signs with a meaning."""
 
 
 def fuzz_one(name: str, options: list[str]) -> None:
@@ -40,6 +63,77 @@ def fuzz_one(name: str, options: list[str]) -> None:
     target = fuzz_targets.TARGETS[name]()
     atheris.Setup([sys.argv[0], *options], target)
     atheris.Fuzz()
+
+
+def mutated(chance: random.Random, seeds: list[bytes]) -> bytes:
+    """A seed, or random bytes, with a few places changed; short ones are most frequent."""
+    if chance.random() < 0.5:
+        return chance.randbytes(int(chance.expovariate(1 / 24)))
+    content = bytearray(chance.choice(seeds))
+    for _ in range(chance.randrange(5)):
+        at = chance.randrange(len(content) + 1)
+        kind = chance.randrange(4)
+        if kind == 0 and at < len(content):
+            content[at] = chance.randrange(256)
+        elif kind == 1:
+            content[at:at] = chance.choice(ODD)
+        elif kind == 2:
+            del content[at : at + chance.randrange(1, 9)]
+        else:
+            content[at : at + 4] = chance.choice(ODD)
+    return bytes(content)
+
+
+def fuzz_blindly(name: str, runs: int, seconds: int, hang_s: int, seed: int) -> int:
+    """Fuzzes one target in this process; gives 1 and keeps the input when something is found. Tells its progress."""
+    import fuzz_targets
+
+    target, seeds = fuzz_targets.TARGETS[name](), fuzz_targets.seeds(name) or [b""]
+    chance = random.Random(seed)
+    data = b""
+
+    def keep(what: str) -> int:
+        folder = fuzz_targets.DATA / name
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{what}-{sha256(data).hexdigest()[:16]}").write_bytes(data)
+        return 1
+
+    def hang(*_: object) -> None:
+        raise TimeoutError(f"longer than {hang_s} s")
+
+    signal.signal(signal.SIGALRM, hang)
+    memory_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begun_s = told_s = time.monotonic()
+    for number in range(runs):
+        if number % 64 == 0:
+            signal.alarm(hang_s)
+            now_s = time.monotonic()
+            if now_s - told_s > TELL_S:
+                told_s = now_s
+                print(f"Done {number} runs", flush=True)
+            if seconds and now_s - begun_s > seconds:
+                print(f"Done {number} runs", flush=True)
+                return 0
+            if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > memory_kb + 1024 * GROWTH_MB:
+                return keep("memory")
+        data = mutated(chance, seeds)
+        try:
+            target(data)
+        except Exception:
+            traceback.print_exc()
+            print(f"Done {number + 1} runs", flush=True)
+            return keep("fault")
+    print(f"Done {runs} runs", flush=True)
+    return 0
+
+
+def run_blindly(name: str, runs: int, seconds: int, hang_s: int, seed: int) -> tuple[int, str]:
+    """The same in a process of its own; as `run`."""
+    command = [sys.executable, __file__, "--one-blindly", *map(str, (name, runs, seconds, hang_s, seed))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    counted = re.findall(r"Done (\d+) runs", done.stdout)
+    count = int(counted[-1]) if counted else 0
+    return count, "" if done.returncode == 0 else done.stderr[-2000:] or f"ended with code {done.returncode}"
 
 
 def run(name: str, runs: int, seconds: int, hang_s: int) -> tuple[int, str]:
@@ -55,7 +149,7 @@ def run(name: str, runs: int, seconds: int, hang_s: int) -> tuple[int, str]:
         new.mkdir()
         command = [
             *(sys.executable, __file__, "--one", name, f"-runs={runs}", f"-max_total_time={seconds}"),
-            *(f"-timeout={hang_s}", f"-rss_limit_mb={MEMORY_MB}", "-max_len=1200", "-len_control=40"),
+            *(f"-timeout={hang_s}", f"-rss_limit_mb={MEMORY_MB}", "-max_len=600", "-len_control=40"),
             *(f"-artifact_prefix={new}/", "-print_final_stats=1", folder),
         ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -81,6 +175,8 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=TOGETHER, help="inputs of all targets together")
     parser.add_argument("--seconds", type=int, default=0, help="for each target at most; 0: no limit")
     parser.add_argument("--hang", type=int, default=HANG_S, help="seconds that one input may take")
+    parser.add_argument("--blind", action="store_true", help="change inputs at random, without atheris")
+    parser.add_argument("--seed", type=int, default=1, help="of --blind")
     parser.add_argument("--list", action="store_true", help="say what there is")
     arguments = parser.parse_args()
     names = arguments.targets or list(SHARES)
@@ -93,9 +189,11 @@ def main() -> int:
     begun_s = time.monotonic()
     for name in names:
         from_s = time.monotonic()
-        count, finding = run(
-            name, max(1, round(arguments.runs * SHARES[name] / whole)), arguments.seconds, arguments.hang
-        )
+        runs = max(1, round(arguments.runs * SHARES[name] / whole))
+        if arguments.blind:
+            count, finding = run_blindly(name, runs, arguments.seconds, arguments.hang, arguments.seed)
+        else:
+            count, finding = run(name, runs, arguments.seconds, arguments.hang)
         total += count
         failed += bool(finding)
         print(
@@ -110,4 +208,6 @@ def main() -> int:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--one"]:
         fuzz_one(sys.argv[2], sys.argv[3:])
+    if sys.argv[1:2] == ["--one-blindly"]:
+        sys.exit(fuzz_blindly(sys.argv[2], *map(int, sys.argv[3:])))
     sys.exit(main())
