@@ -38,19 +38,8 @@ MEMORY_MB = 900
 GROWTH_MB = 300
 """With --blind: beyond what the first input needed."""
 TELL_S = 10.0
-ODD = [
-    b"\0",
-    b"\xff",
-    b"\xfd",
-    b"\xfe",
-    b"\0\0\xc0\x7f",
-    b"\0\0\x80\x7f",
-    b"\xff\xff\xff\x7f",
-    b"=",
-    b'"',
-    b"nan",
-    b"[[",
-]
+NAN_INF_LARGE = [b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\xff\xff\xff\x7f"]
+ODD = [b"\0", b"\xff", b"\xfd", b"\xfe", *NAN_INF_LARGE, b"=", b'"', b"nan", b"[["]
 """What breaks things: magic bytes, numbers that are none or infinite, signs with a meaning."""
 
 
