@@ -316,6 +316,7 @@ class FlightLoop:
         self._sequence = Sequence(
             *(self._flight, self._trajectory, self._ops, self._autopilot, self._engage, self._notify),
             only_gates=self._only_gates,
+            waits=lambda: self._peer.paced,
         )
         self._met = True
 

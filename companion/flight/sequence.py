@@ -7,8 +7,10 @@ can step it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 
 from companion.config import Flight
 from companion.control.types import Vec3
@@ -16,9 +18,10 @@ from companion.errors import RefusedError
 from companion.flight.course import Course
 from companion.flight.orders import Orders
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Order, Phase
+from companion.flight.planning import Planning
 from companion.flight.preflight import Preflight
 from companion.flight.surroundings import gate_ground
-from companion.frames import yaw_from_quat
+from companion.frames import GeoPoint, yaw_from_quat
 from companion.link import modes
 from companion.link.modes import Mode
 from companion.link.operations import Operation, Operations, Retry
@@ -41,6 +44,8 @@ CONFIRM_TIMEOUT_S = 2.5
 """HEARTBEAT comes once per second: the longest a mode change may take to be seen there."""
 START_SPEED_MAX_M_S = 1.0
 """Faster, the vehicle does not hold, and there is no hold point to begin from."""
+DRIFT_MAX_M = 0.5
+"""Moved further while its course was planned, the vehicle would begin with a step."""
 START_TIMEOUT_S = 30.0
 HANDOVER_MODES = (modes.HOLD, modes.LAND)
 """What the autopilot is asked for at the end, the next one where it refuses the one before."""
@@ -78,6 +83,7 @@ class Sequence:
         engage: called with the state at which OFFBOARD was confirmed, before the first tracking step.
         notify: called with a line for people.
         only_gates: the gates judge, and nothing is asked of the vehicle after that.
+        waits: whether the vehicle's time stands still while we compute (lockstep).
     """
 
     def __init__(
@@ -90,6 +96,7 @@ class Sequence:
         notify: Callable[[str], None],
         *,
         only_gates: bool = False,
+        waits: Callable[[], bool] = lambda: True,
     ) -> None:
         self.phase = Phase.CONNECT
         self.changes: list[PhaseChange] = []
@@ -106,6 +113,8 @@ class Sequence:
         self._notify = notify
         self.preflight = Preflight(flight, operations, autopilot, notify)
         self._only_gates = only_gates
+        self._waits = waits
+        self._planning: Planning | None = None
         self._state: VehicleState | None = None
         self._state_s = 0.0
         self._since_s = 0.0
@@ -301,6 +310,7 @@ class Sequence:
                 if self._watched_hold(now_s):
                     self._plan_course(now_s)
                 return
+        self._planning = None  # it does not hold where a plan would begin
         if self._operation is None and (autopilot.mode, autopilot.intended) != (modes.HOLD, modes.HOLD):
             self._operation = self._ops.set_mode(modes.HOLD, now_s)
         if self._operation is not None and self._refused(self._operation, now_s):
@@ -327,23 +337,32 @@ class Sequence:
 
     def _plan_course(self, now_s: float) -> None:
         """Plans join and stop from where the vehicle is held, while the autopilot still has it."""
-        state = self._state
-        assert state is not None
-        hold: Vec3 = state.p
+        if self._planning is None:
+            assert self._state is not None
+            where, home = self._state.p, self._autopilot.home
+            make = partial(self._new_course, where, yaw_from_quat(self._state.q), home, self._autopilot.home_global)
+            self._planning = Planning(make, aside=not self._waits())
         try:
-            self.course = Course(
-                self._trajectory,
-                self._flight.vehicle,
-                hold,
-                yaw_from_quat(state.q),
-                home_for(self._trajectory, self._autopilot.home, self._autopilot.home_global),
-            )
-            gate_ground(self.course.path, self._autopilot.home, self._flight.height_min_m)
+            course = self._planning.course()
         except RefusedError as error:
             raise FlightEnded(Cause.REFUSED, str(error)) from None
+        if course is None:
+            return
+        self._planning = None
+        assert self._state is not None
+        if math.dist(course.hold_point, self._state.p) > DRIFT_MAX_M:
+            return  # and again, from where it is now
+        self.course = course
         self._operation = None
         self._since_s = now_s
         self.duty = Duty.STREAM
+
+    def _new_course(self, hold: Vec3, yaw_rad: float, home: Vec3 | None, home_global: GeoPoint | None) -> Course:
+        """Runs beside the loop: it only uses what it is given and what never changes."""
+        trajectory, flight = self._trajectory, self._flight
+        course = Course(trajectory, flight.vehicle, hold, yaw_rad, home_for(trajectory, home, home_global))
+        gate_ground(course.path, home, flight.height_min_m)
+        return course
 
     def _enter_offboard(self, now_s: float) -> None:
         """Streams, asks for OFFBOARD, and engages when the acknowledgement and the reported mode agree."""
