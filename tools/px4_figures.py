@@ -149,7 +149,19 @@ def fly(session: Session, row: Row, words: list[str], folder: Path) -> dict[str,
     """One flight, from wherever the vehicle is; returns its summary with what the simulator knows."""
     session.wind(row.wind_m_s, 0.0)
     time.sleep(SETTLE_S)
-    command = [sys.executable, "-m", "companion", "fly", *words, "--json", "--timeout", "30", "--out", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "companion",
+        "fly",
+        *words,
+        "--simulator",
+        "--json",
+        "--timeout",
+        "30",
+        "--out",
+        str(folder),
+    ]
     step_s = math.nan
     with (folder.parent / f"{folder.name}.log").open("wb") as log:
         flight = subprocess.Popen([*command, "--connect", session.connection], stdout=log, stderr=log)
