@@ -10,6 +10,7 @@ name that environment's Python. Without --only all rows are measured and the tab
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 import tempfile
 import time
@@ -64,6 +65,9 @@ def main() -> None:
     def say(text: str) -> None:
         print(f"[{time.monotonic() - begin:5.0f} s] {text}", file=sys.stderr, flush=True)
 
+    out = arguments.out or (None if arguments.only or arguments.quick else ROOT / "docs" / "performance.md")
+    if arguments.quick:
+        before += "; a short run (--quick): fewer rounds, less certain"
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         setting = Setting(arguments.quick, arguments.rotorpy_python, Path(folder), say)
@@ -73,10 +77,10 @@ def main() -> None:
             except NotHereError as error:
                 say(f"{name}: not measured: {error}")
                 rows.append(Row(name, "", "", f"not measured: {error}", ""))
-    out = arguments.out or (None if arguments.only or arguments.quick else ROOT / "docs" / "performance.md")
-    if out is not None:
-        out.write_text(page(rows, before), encoding="utf-8")
-        say(f"written: {out.name}")
+            except subprocess.TimeoutExpired:
+                rows.append(Row(name, "", "", "not measured: it took too long", ""))
+            if out is not None:  # what is there survives an interruption
+                out.write_text(page(rows, before), encoding="utf-8")
     print(table(rows))
 
 
