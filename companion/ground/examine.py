@@ -168,7 +168,7 @@ def _main() -> None:
     os.dup2(2, 1)  # what a library prints is no verdict
     check, memory_max_bytes, cpu_max_s = pickle.load(sys.stdin.buffer)  # from the program that started this one
     path = Path(os.fsdecode(sys.stdin.buffer.read()))
-    os.nice(_NICENESS)
+    os.nice(max(0, _NICENESS - os.nice(0)))  # not on top of the ground process's own
     resource.setrlimit(resource.RLIMIT_AS, (memory_max_bytes, memory_max_bytes))
     resource.setrlimit(resource.RLIMIT_CPU, (cpu_max_s, cpu_max_s))
     with os.fdopen(out, "w") as result:
