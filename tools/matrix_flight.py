@@ -17,6 +17,7 @@ from typing import Any
 import tomlkit
 
 from companion.config import Flight, build_flight, find, read_toml
+from companion.flight import loop as loop_module
 from companion.flight.bundled import free_udp_port
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Outcome, Phase
@@ -45,7 +46,8 @@ ALONE_S = 20.0
 ALONE_MAX_S = 60.0
 DOWN_S = 4.0
 """One that is down and disarmed is watched for so long: longer than a reboot takes."""
-TURNS_MAX = 2_000_000
+SILENCE_WALL_S = 60.0
+"""In the place of the loop's limit on a silent vehicle in lockstep: here the machine may be as busy as it likes."""
 UNANSWERED_MAX = 50
 """Turns of the companion without an answer to the vehicle's clock, after which the clock moves all the same."""
 PARAMETERS: dict[str, int | float] = {"COM_OBL_RC_ACT": 5}
@@ -147,6 +149,7 @@ class Stage:
         self.every_state: list[Callable[[], None]] = []
         """Called before each state of the vehicle."""
         self.injected: list[str] = []
+        loop_module.PACED_SILENCE_S = SILENCE_WALL_S
         self._compiled = kernels(engine) if compiled is None else compiled
         self._waiting = list(happenings)
         self._phase: Phase = Phase.CONNECT
