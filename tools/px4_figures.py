@@ -273,6 +273,7 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     """Exit code 0: everything was reached."""
     options = arguments()
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # PX4 is stopped on the way out
     vehicle = merged(read_toml(find(options.vehicle, "vehicles")), nested(options.set))
     out = options.out or Path("flights") / datetime.now(UTC).strftime("px4-%Y%m%dT%H%M%SZ")
     out = out.absolute()
