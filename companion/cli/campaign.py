@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from companion.campaign.run import Ran
     from companion.campaign.study import Study
 
-EXAMPLE = """Examples: companion campaign robustness --count 500;
-companion campaign region --scheduler local; companion campaign replay campaigns/region 17"""
+EXAMPLE = """Again, flight 17 of a campaign: companion campaign replay campaigns/region 17. On a cluster of its own:
+companion campaign region --scheduler local. Example: companion campaign robustness --count 500"""
 CAMPAIGNS = Path("campaigns")
 
 
