@@ -138,7 +138,7 @@ def test_in_lockstep_the_same_seed_gives_the_same_flight() -> None:
 def test_waiting_ends_with_how_the_vehicle_is() -> None:
     with (
         RunningVehicle(start=(0.0, 0.0, -5.0, 90.0)) as vehicle,
-        pytest.raises(TimeoutError, match=r"Hold, armed, at 0\.0"),
+        pytest.raises(TimeoutError, match=r"Hold, armed, at -?0\.0"),
     ):
         vehicle.wait_until(lambda: vehicle.landed, 0.05)
 

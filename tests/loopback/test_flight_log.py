@@ -21,6 +21,7 @@ from companion.campaign.replay import replay
 from companion.flight.launch import control
 from companion.flight.phases import PHASE_NAMES
 from companion.flight.tracker import kernels
+from companion.link.vehicle_link import VehicleLink
 from companion.record import topics
 from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES
 from companion.record.flight_record import FlightRecord
@@ -113,7 +114,7 @@ def test_a_killed_control_process_leaves_its_log(tmp_path: Path) -> None:
         process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "companion.flight.process"),
-                *(str(folder), connection, "python", "30", str(theirs.fileno())),
+                *(str(folder), VehicleLink(connection).as_json(), "python", "30", str(theirs.fileno())),
             ],
             pass_fds=(theirs.fileno(),),
         )

@@ -92,7 +92,7 @@ def test_what_the_command_line_does_not_know(refusal: Refusal, arguments: list[s
         (["demo", "--wind", "-12,0"], "--wind '-12,0': expected three numbers north,east,down in m/s"),
         (["demo", "--wind", "nan,0,0"], "world.wind_m_s.0 = nan"),
         (["demo", "--turbulence", "-0.1"], "world.turbulence = -0.1"),
-        (["demo", "--controller", "pid"], "output.controller = 'pid': input should be 'law' or 'px4'"),
+        (["demo", "--controller", "pid"], "output.controller = 'pid': input should be 'law', 'px4' or 'calibration'"),
         (["demo", "--controller", "px4", "--output", "rates"], "the reference itself is sent: leave one out"),
         (["fly", "circle", "--vehicle", "bundled", "--controller", "px4", "--output", "rates"], "leave one out"),
         (["certify", "eight", "--start", "1,2"], "--start '1,2': expected three numbers"),

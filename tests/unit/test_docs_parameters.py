@@ -67,6 +67,7 @@ def test_all_gains_and_the_heading_can_be_set():
         "late_steps_max",
         "link_silence_max_s",
         "measured_delay",
+        "rate_error_max_rad_s",
         "state_age_max_s",
         "state_rate_min",
     }
