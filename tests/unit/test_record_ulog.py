@@ -187,7 +187,7 @@ class Vehicle:
         return self.says(
             mavlink.MAVLink_odometry_message(
                 *(t_us, 1, 1, *p, list(q), 0.5, -0.25, 0.125),
-                *(0.1 + 1e-9 * (t_us - START_US), 0.2, 0.3),  # an estimate that never changes at all is none
+                *(0.1 + 1e-10 * (t_us - START_US), 0.2, 0.3),  # an estimate that never changes at all is none
                 *(none, none, resets, 1, 100),
             )
         )
