@@ -18,6 +18,7 @@ import tomlkit
 from companion.config import Flight, build_flight, find, read_toml
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
+from companion.flight.planning import Planning
 from companion.flight.tracker import kernels
 from companion.link.codec import message_formats
 from companion.link.framing import Frame, FrameParser, LinkCounters, build_frame
@@ -157,6 +158,8 @@ def make_wire(
     def make(start: tuple[Any, float] | None) -> VirtualWire:
         wire = VirtualWire(Vehicle(VehicleOptions(vehicle=load(str(path)), start=start, engine="python")))
         monkeypatch.setattr(time, "monotonic_ns", lambda: wire.now_ns)
+        # a thread's time is not the wire's: planned at once, the same flight comes out every time
+        monkeypatch.setattr("companion.flight.sequence.Planning", lambda plan, aside: Planning(plan, aside=False))
         return wire
 
     return make
