@@ -10,11 +10,14 @@ from typing import NamedTuple
 
 from companion.campaign.simulate import Trace, fly_sampled
 from companion.config import Flight, SimulatedWorld, Start, Vehicle
+from companion.control import flat
 from companion.control.certificate import ThrustBounds, thrust_bounds
 from companion.control.law import errors, lyapunov, torque
 from companion.control.types import GRAVITY_M_S2, State, Vec3
 from companion.control.vectors import norm
 from companion.errors import RefusedError
+from companion.flight.envelope import Envelope
+from companion.flight.guards import Guard, disturbance_step
 from companion.flight.tracker import Kernels
 from companion.frames import degrees, quat_from_yaw, radians, tilt_from_quat
 from companion.record.columns import LIMIT_RATE_ROLL_PITCH, LIMIT_RATE_YAW, LIMIT_THRUST_MAX, LIMIT_THRUST_MIN
@@ -32,6 +35,17 @@ class Extreme(NamedTuple):
     at_s: float
 
 
+class Excess(NamedTuple):
+    """V_H above the envelope that the flight's guard LYAPUNOV watches, for as long as that guard bears it."""
+
+    value_m2: float
+    most_m2: float
+    part: str
+    """"horizontal", "vertical" or "all axes"."""
+    at_s: float
+    """When the guard answers."""
+
+
 class Prediction(NamedTuple):
     """The extremes of a simulated flight; times from the moment of engaging."""
 
@@ -47,6 +61,8 @@ class Prediction(NamedTuple):
     """How long the thrust stands at a limit."""
     rate_limited_s: float
     """How long a commanded rate is cut."""
+    excess: Excess | None = None
+    """None: the guard of V_H stays silent."""
 
 
 def _largest(values: list[float], times: list[float]) -> Extreme:
@@ -73,7 +89,27 @@ def extremes(trace: Trace, vehicle: Vehicle) -> Prediction:
         _largest([norm(row.errors[0]) for row in rows], times),
         float((flags & (LIMIT_THRUST_MIN | LIMIT_THRUST_MAX) != 0).sum()) * interval,
         float((flags & (LIMIT_RATE_ROLL_PITCH | LIMIT_RATE_YAW) != 0).sum()) * interval,
+        _excess(trace, vehicle),
     )
+
+
+def _excess(trace: Trace, vehicle: Vehicle) -> Excess | None:
+    """What the guard of V_H would answer first."""
+    parameters = vehicle.parameters()
+    envelope = Envelope(parameters.gains, parameters.model.drag, disturbance_step(vehicle.limits))
+    bears_s = Guard.LYAPUNOV.value.stages[0].after_s
+    numbers = [0.0] * (max(flat.ERRORS.stop, flat.LYAPUNOV + 1))
+    begun_s: float | None = None
+    for row, level in zip(trace.rows, trace.record.column("lyapunov").tolist(), strict=True):
+        numbers[flat.ERRORS], numbers[flat.LYAPUNOV] = (x for e in row.errors for x in e), level
+        found = envelope.excess(tuple(numbers), row.t_s)
+        if found is None:
+            begun_s = None
+            continue
+        begun_s = row.t_s if begun_s is None else begun_s
+        if row.t_s - begun_s >= bears_s:
+            return Excess(*found, row.t_s)
+    return None
 
 
 def start_at(flight: Flight, trajectory: Trajectory) -> Start:
@@ -99,7 +135,7 @@ def gate_prediction(flight: Flight, trajectory: Trajectory, compiled: Kernels) -
     """Refuses a flight whose nominal prediction leaves its limits, with time and size of the violation.
 
     Raises:
-        RefusedError: tilt or position error leave their limits, or the loop diverges.
+        RefusedError: tilt, position error or V_H leave their limits, or the loop diverges.
     """
     found = predict(flight, trajectory, compiled)
     limits = flight.vehicle.limits
@@ -112,6 +148,13 @@ def gate_prediction(flight: Flight, trajectory: Trajectory, compiled: Kernels) -
                 f"flight {flight.name!r} is predicted to leave its limits: {name} {extreme.value:.2f} {unit} at"
                 f' {extreme.at_s:.2f} s, limit {limit:g} {unit} (limits.{key}); start nearer, or use join = "smooth"'
             )
+    if found.excess is not None:
+        value, most, part, at_s = found.excess
+        raise RefusedError(
+            f"flight {flight.name!r} is predicted to be ended by its guard LYAPUNOV at {at_s:.2f} s: V_H ({part})"
+            f" {value:.3g} m^2, envelope {most:.3g} m^2; fly it slower, with the nose along the path at the start, or"
+            " with lower heading gains"
+        )
     return found
 
 

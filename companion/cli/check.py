@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.common import FrameOption, JsonOption, TimeScaleOption, frame_named
+from companion.cli.common import FrameOption, JsonOption, LapsOption, TimeScaleOption, frame_named
 
 if TYPE_CHECKING:
     from companion.campaign.predict import Prediction
@@ -40,6 +40,7 @@ def run(
         typer.Option("--start", metavar="N,E,D[,DEG]", help="Where the vehicle holds before, from home; its heading."),
     ] = None,
     time_scale: TimeScaleOption = None,
+    laps: LapsOption = None,
     fence: Annotated[
         Path | None,
         typer.Option("--fence", metavar="FILE", help="Keep to the geofence of this mission file too."),
@@ -67,7 +68,7 @@ def run(
     held = _start(start)
     frames = [own_frame if len(files) == 1 or _takes_frame(file) else None for file in files]
     trajectories = [
-        load(file, time_scale, vehicle=flown_by, frame=own) for file, own in zip(files, frames, strict=True)
+        load(file, time_scale, vehicle=flown_by, frame=own, laps=laps) for file, own in zip(files, frames, strict=True)
     ]
     gains = _gains(flown_by)
     checked = [_check(trajectory, flown_by, held, other_fence, height_min, gains) for trajectory in trajectories]

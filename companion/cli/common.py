@@ -77,6 +77,10 @@ TrajectoryOption = Annotated[
 TimeScaleOption = Annotated[
     float | None, typer.Option("--time-scale", metavar="X", help="Fly the trajectory X times as fast.")
 ]
+LapsOption = Annotated[
+    int | None,
+    typer.Option("--laps", metavar="N", min=1, help="Fly it N times, with a smooth way back where it does not close."),
+]
 
 
 def say(text: str, *, quiet: bool = False) -> None:

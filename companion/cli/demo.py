@@ -13,6 +13,7 @@ from companion.cli.common import (
     FaultsOption,
     FrameOption,
     JsonOption,
+    LapsOption,
     LiveOption,
     OutOption,
     RealtimeOption,
@@ -54,6 +55,7 @@ def run(
     wind: WindOption = None,
     turbulence: TurbulenceOption = None,
     time_scale: TimeScaleOption = None,
+    laps: LapsOption = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of noise and gusts.")] = None,
     faults: FaultsOption = None,
     key: VehicleKeyOption = None,
@@ -87,7 +89,7 @@ def run(
         "vehicle__simulated": True,
         "world__seed": seed,
     }
-    configured = embedded(load_flight(flight, adjustments(**changes)), time_scale)
+    configured = embedded(load_flight(flight, adjustments(**changes)), time_scale, laps)
     start_of(configured)
     VehicleLink(key=key).check()
     say_notes(of_flight(configured).notes, quiet=as_json)

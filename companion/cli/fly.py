@@ -18,6 +18,7 @@ from companion.cli.common import (
     FaultsOption,
     FrameOption,
     JsonOption,
+    LapsOption,
     LiveOption,
     OutOption,
     RealtimeOption,
@@ -68,6 +69,7 @@ def run(
     controller: ControllerOption = None,
     land: Annotated[bool, typer.Option("--land", help="Land at the end instead of holding.")] = False,
     time_scale: TimeScaleOption = None,
+    laps: LapsOption = None,
     frame: FrameOption = None,
     timeout: Annotated[float, typer.Option("--timeout", metavar="S", help="How long to wait for the vehicle.")] = 15.0,
     out: OutOption = None,
@@ -114,7 +116,7 @@ def run(
         configured = build_flight(base, "command line", adjustments(**changes))
     else:
         configured = load_flight(flight, adjustments(**changes, **vehicle_changes(vehicle)))
-    complete = embedded(configured, time_scale)
+    complete = embedded(configured, time_scale, laps)
     say_notes(of_flight(complete).notes, quiet=as_json)
     with flight_display(quiet=as_json, live=live, rerun=rerun, rerun_file=rerun_file) as display:
         folder = prepare(complete, out)

@@ -12,6 +12,7 @@ from companion.cli.common import (
     EngineOption,
     FrameOption,
     JsonOption,
+    LapsOption,
     TimeScaleOption,
     TrajectoryOption,
     adjustments,
@@ -35,6 +36,7 @@ def run(
     trajectory: TrajectoryOption = None,
     frame: FrameOption = None,
     time_scale: TimeScaleOption = None,
+    laps: LapsOption = None,
     allow_uncertified: Annotated[
         bool, typer.Option("--allow-uncertified", help="Try gains that no flight would be allowed with.")
     ] = False,
@@ -53,7 +55,7 @@ def run(
     from companion.trajectory.load import embedded, of_flight
 
     changes = {**vehicle_changes(vehicle), **trajectory_changes(trajectory, frame)}
-    configured = embedded(load_flight(flight, adjustments(**changes)), time_scale)
+    configured = embedded(load_flight(flight, adjustments(**changes)), time_scale, laps)
     if configured.output.controller != "law":
         raise InputError(
             f"flight {configured.name!r} is PX4's own controller's (output.controller); simulate computes the law"

@@ -22,7 +22,15 @@ def _not_zero(value: float) -> float:
     return value
 
 
+def _printable(value: str) -> str:
+    if not value.isprintable() or value != value.strip():
+        raise ValueError("must be printable characters, without space around them")
+    return value
+
+
 NotZero = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_not_zero)]
+Name = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_printable)]
+"""What a trajectory is called where its file's name is not wanted."""
 
 
 class Table(Section):
@@ -189,6 +197,7 @@ class HelixTable(ShapeTable):
 class Definition(Table):
     """A trajectory file as a whole."""
 
+    name: Name | None = None
     shape: ShapeName
     anchor: Anchor = "here"
     anchor_yaw_deg: Finite = 0.0

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from companion.config import Finite, NotNegative, Positive, Vector, Vehicle
 from companion.frames import Frame, GeoPoint, radians
 from companion.trajectory.anchored import Anchor, JoinKind
-from companion.trajectory.definition import Table
+from companion.trajectory.definition import Name, Table
 from companion.trajectory.files import Options
 from companion.trajectory.formats import NAMES
 from companion.trajectory.formats.contents import Leg, Route
@@ -65,6 +65,7 @@ class HeadingTable(Table):
 class PlacedTable(Table):
     """The keys that every trajectory file has."""
 
+    name: Name | None = None
     anchor: Anchor | None = None
     anchor_yaw_deg: Finite = 0.0
     join: JoinKind = "smooth"

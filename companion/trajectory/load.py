@@ -35,6 +35,7 @@ def load(
     *,
     vehicle: Vehicle | None = None,
     frame: Frame | None = None,
+    laps: int | None = None,
     confined: bool = False,
 ) -> Trajectory:
     """Return the trajectory of a file.
@@ -44,6 +45,7 @@ def load(
         time_scale: replaces the file's; 2.0 flies it twice as fast, in half the time.
         vehicle: what paths through points are planned for; needed for these alone.
         frame: of another program's file, where its format leaves that open.
+        laps: replaces the file's, and its duration_s.
         confined: a file of ours may only name files in its own folder: for files that came from somewhere else.
 
     Raises:
@@ -52,7 +54,7 @@ def load(
 
     """
     path = find(str(name), "trajectories")
-    table = _table_of(path, frame)
+    table = _flown(_table_of(path, frame), None, laps)
     called = shown(str(path))
     other = table.get("file") if path.suffix.lower() == ".toml" else None
     if confined and isinstance(other, str) and Path(other).parent != path.parent.absolute():
@@ -72,7 +74,7 @@ def build(
 
     Args:
         data: the parsed TOML.
-        name: what to call the trajectory.
+        name: what to call the trajectory, unless it has a name of its own.
         source: what to call the file in errors.
         time_scale: replaces the file's.
         vehicle: as in `load`.
@@ -92,7 +94,7 @@ def build(
     definition = validate(Definition, data, source)
     scale = definition.time_scale if time_scale is None else time_scale
     return Trajectory(
-        name=name,
+        name=definition.name or name,
         shape=definition.built_shape(),
         duration_s=_duration_s(definition.shape_duration_s(), scale, source),
         anchor=definition.anchor,
@@ -167,7 +169,7 @@ def _placed(
     if definition.laps > 1:
         made = _repeated(made, definition, scale, source, vehicle)
     return Trajectory(
-        name=name,
+        name=definition.name or name,
         shape=made.shape,
         duration_s=_duration_s(made.duration_s, scale, source),
         anchor=definition.anchor or ("here" if made.origin is None else "home"),
@@ -197,10 +199,9 @@ def of_flight(flight: Flight) -> Trajectory:
     """Return the trajectory that a flight names, or that stands in its file as a table."""
     if isinstance(flight.trajectory, str):
         return load(flight.trajectory, vehicle=flight.vehicle)
-    data = dict(flight.trajectory)
-    name = str(data.pop("name", "unnamed"))
-    source = f"flight {flight.name!r}: trajectory {name!r}"
-    return build(data, name, source, vehicle=flight.vehicle)
+    data = flight.trajectory
+    source = f"flight {flight.name!r}: trajectory {data.get('name', 'unnamed')!r}"
+    return build(data, "unnamed", source, vehicle=flight.vehicle)
 
 
 def table_of(name: str, frame: Frame | None = None) -> dict[str, Any]:
@@ -220,18 +221,26 @@ def table_of(name: str, frame: Frame | None = None) -> dict[str, Any]:
     return _pinned({"name": shown(path.stem), **_table_of(path, frame)})
 
 
-def embedded(flight: Flight, time_scale: float | None = None) -> Flight:
+def embedded(flight: Flight, time_scale: float | None = None, laps: int | None = None) -> Flight:
     """Return the flight with its trajectory as a table, so that its file says all that was flown.
 
     Args:
         flight: names a trajectory, or holds one.
         time_scale: replaces the trajectory's own.
+        laps: replaces the trajectory's own, and its duration_s.
     """
     named = flight.trajectory
     table = table_of(named) if isinstance(named, str) else _pinned(dict(named))
+    return flight.model_copy(update={"trajectory": _flown(table, time_scale, laps)})
+
+
+def _flown(table: dict[str, Any], time_scale: float | None, laps: int | None) -> dict[str, Any]:
+    """Return the table with another pace and number of laps; None leaves what it says."""
     if time_scale is not None:
-        table["time_scale"] = time_scale
-    return flight.model_copy(update={"trajectory": table})
+        table = {**table, "time_scale": time_scale}
+    if laps is not None:
+        table = {key: value for key, value in table.items() if key != "duration_s"} | {"laps": laps}
+    return table
 
 
 def stored(flight: Flight, folder: Path) -> Flight:

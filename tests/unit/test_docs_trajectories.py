@@ -40,8 +40,9 @@ def test_the_commands_run(line: str, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert program == "companion"
     if command != "check":  # a flight takes too long: its options are parsed, its file is loaded
         assert main([command, *arguments, "--help"]) == 0
+        bundled = load_vehicle("bundled")
         for name in (argument for argument in arguments if argument.endswith(".csv")):
-            assert load(name, frame="enu" if "enu" in arguments else None).duration_s > 10.0
+            assert load(name, frame="enu" if "enu" in arguments else None, vehicle=bundled).duration_s > 10.0
         return
     figures = predict.Prediction(*(predict.Extreme(1.0, 0.5) for _ in range(6)), 0.0, 0.0)
     monkeypatch.setattr(predict, "gate_prediction", lambda *_: figures)

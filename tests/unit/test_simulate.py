@@ -8,9 +8,10 @@ import pytest
 
 from companion.campaign.predict import gate_prediction, predict
 from companion.campaign.simulate import CSV_COLUMNS, fly_ideal, fly_sampled, write_csv
-from companion.config import SimulatedWorld, Start, load_flight
+from companion.config import Flight, SimulatedWorld, Start, load_flight, load_vehicle
 from companion.errors import InputError, RefusedError
 from companion.flight.tracker import kernels
+from companion.frames import degrees
 from companion.trajectory.load import build, load
 
 PLAIN = kernels("python")
@@ -79,6 +80,23 @@ def test_prediction_names_time_and_size_of_the_worst_violation():
     vehicle = flight.vehicle.model_copy(update={"limits": tight})
     with pytest.raises(RefusedError, match=r"tilt 0\.\d+ rad at \d\.\d+ s, limit 0\.1 rad \(limits\.tilt_max_rad\)"):
         gate_prediction(flight.model_copy(update={"vehicle": vehicle}), trajectory, PLAIN)
+
+
+def test_a_flight_that_its_guard_would_end_is_refused_with_the_guards_words(tmp_path):
+    """Gains that turn the nose as fast as they can, while the vehicle leans into a path that begins abeam."""
+    points = tmp_path / "points.toml"
+    lines = "".join(f"[[waypoint]]\np_m = {p}\n" for p in ([0.0, 0.0, -9.0], [4.0, 0.0, -9.0], [4.0, 3.0, -9.0]))
+    points.write_text(f'shape = "waypoints"\nanchor = "local"\n{lines}')
+    vehicle = load_vehicle("bundled")
+    trajectory = load(points, vehicle=vehicle)
+    begin_deg = degrees(trajectory.at(0.5).yaw)
+    flight = Flight(name="test", vehicle=vehicle, trajectory="points")
+    abeam = flight.model_copy(update={"start": Start(position_m=(0.0, 0.0, -9.0), yaw_deg=begin_deg + 90.0)})
+    assert gate_prediction(abeam, trajectory, PLAIN).excess is None
+    quick = vehicle.controller.model_copy(update={"heading_l1_1_s": 2.0, "heading_l2_1_s": 4.0})
+    hasty = abeam.model_copy(update={"vehicle": vehicle.model_copy(update={"controller": quick})})
+    with pytest.raises(RefusedError, match=r"ended by its guard LYAPUNOV at [12]\.\d+ s: V_H \(vertical\) 0\.0\d+ m"):
+        gate_prediction(hasty, trajectory, PLAIN)
 
 
 def test_a_flight_without_start_is_predicted_from_the_trajectory_and_not_simulated():

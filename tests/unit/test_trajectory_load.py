@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import bundled_root, load_vehicle
+from companion.config import Flight, build_flight, bundled_root, load_vehicle
 from companion.errors import InputError
 from companion.trajectory.anchored import anchored
 from companion.trajectory.feasibility import check
 from companion.trajectory.flatness import PointMass, ReferenceLimits
 from companion.trajectory.joins import join, stop
-from companion.trajectory.load import load
+from companion.trajectory.load import embedded, load, of_flight
 from companion.trajectory.pieces import chain, sample
 from companion.trajectory.shapes import Circle, Hover, Lemniscate
 
@@ -115,6 +115,27 @@ def test_single_line_ends_by_itself(tmp_path: Path) -> None:
     assert load(written(tmp_path, text), 2.0).duration_s == 2.0
 
 
+def test_a_file_may_have_a_name_of_its_own(tmp_path: Path) -> None:
+    assert load(written(tmp_path, 'name = "round the tree"\n' + CIRCLE)).name == "round the tree"
+    named = flight_table(written(tmp_path, CIRCLE.replace("laps", 'name = "inner"\nlaps')))
+    assert of_flight(named).name == "inner"
+
+
+def test_laps_of_the_command_line_go_before_those_of_the_file(tmp_path: Path) -> None:
+    lap_s = load(written(tmp_path, CIRCLE)).duration_s / 2.0
+    assert load(written(tmp_path, CIRCLE), laps=5).duration_s == pytest.approx(5.0 * lap_s)
+    timed = written(tmp_path, CIRCLE.replace("laps = 2", "duration_s = 3.0"))
+    assert load(timed, laps=3).duration_s == pytest.approx(3.0 * lap_s)
+    assert of_flight(flight_table(timed, laps=3)).duration_s == pytest.approx(3.0 * lap_s)
+    with pytest.raises(InputError, match="does not repeat"):
+        load(written(tmp_path, LINE.format("")), laps=2)
+
+
+def flight_table(path: Path, **options: int) -> Flight:
+    """A flight that has the file's trajectory as a table."""
+    return embedded(build_flight({"name": "x", "vehicle": "bundled", "trajectory": str(path)}, "test"), **options)
+
+
 LINE = 'shape = "line"\n{}[line]\nfrom_m = [0, 0, 0]\nto_m = [3, 0, 0]\nmove_s = 4\n'
 LISSAJOUS = 'shape = "lissajous"\nduration_s = 9\n[lissajous]\namplitude_m = {}\nangular_rate_rad_s = {}\n'
 
@@ -126,6 +147,8 @@ WRONG = {
         CIRCLE + "radius = 5\n",
         ["circle", "unknown key 'radius' = 5", "allowed: center_m, radius_m"],
     ),
+    "name that is none": ("name = 5\n" + CIRCLE, ["name = 5", "string"]),
+    "name of two lines": ('name = "a\\nb"\n' + CIRCLE, ["name = 'a\\nb'", "printable"]),
     "unknown table": (CIRCLE + "[circel]\nradius_m = 1\n", ["unknown key 'circel'"]),
     "missing key": (CIRCLE.replace("radius_m = 5", ""), ["circle.radius_m is missing"]),
     "missing shape": (CIRCLE.replace('shape = "circle"', ""), ["shape is missing"]),
