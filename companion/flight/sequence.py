@@ -435,7 +435,9 @@ class Sequence:
     def _land(self, now_s: float) -> None:
         if self._operation is None:
             self._operation = self._ops.land(now_s)
-        elif self._operation.accepted:
+        elif self._operation.accepted or self._autopilot.mode == modes.LAND:
+            # The mode may be reported before the acknowledgement, which a lossy link loses: the law must not be judged
+            # by a descent that is not its own.
             self.duty = Duty.NOTHING
         elif self._refused(self._operation, now_s):
             return

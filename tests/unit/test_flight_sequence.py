@@ -260,6 +260,20 @@ def test_landing_ends_on_the_ground() -> None:
     assert (ended.cause, ended.detail) == (Cause.COMPLETED, "landed and disarmed")
 
 
+def test_landing_whose_acknowledgement_is_lost_is_known_by_the_mode() -> None:
+    script = Script(after="land", duration_s=0.5)
+    script.to_track()
+    script.ops.at_once = False
+    script.until(lambda: script.ops.asked[-1].what == "landing")
+    script.run(0.1)
+    assert script.sequence.duty is Duty.TRACK, "nothing says yet that the autopilot has taken over"
+    script.be(modes.LAND)
+    script.run(0.01)
+    assert script.sequence.duty is Duty.NOTHING
+    script.autopilot.landed, script.autopilot.armed = LandedState.ON_GROUND, False
+    assert script.ends().cause is Cause.COMPLETED
+
+
 def test_px4_goes_back_to_offboard_on_the_ground_before_it_says_disarmed() -> None:
     script = landing()
     script.autopilot.landed = LandedState.ON_GROUND
