@@ -1,4 +1,4 @@
-"""Measures the figures that the project promises, in one run, and prints them as a table.
+"""Measures the figures that the project promises, in one run, and prints a table, each row when it is measured.
 
     python tools/figures.py [--quick] [--only GROUP ...] [--out FOLDER]
 
@@ -20,9 +20,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink2
@@ -49,6 +49,9 @@ from companion.trajectory.anchored import Trajectory, anchored
 from companion.trajectory.feasibility import check
 from companion.trajectory.load import load
 from companion.trajectory.waypoints import Waypoint, plan, plan_limits
+
+Row = tuple[str, str, str]
+"""What is measured, what it should be, what was seen."""
 
 
 def demo(folder: Path, *options: str) -> dict[str, Any]:
@@ -77,7 +80,7 @@ def speed(folder: Path) -> float:
     return (last[0] - first[0]) / (last[1] - first[1])
 
 
-def flights(base: Path, quick: bool) -> list[tuple[str, str, str]]:
+def flights(base: Path, quick: bool) -> Iterator[Row]:
     """Accuracy: every row is a flight."""
     cases: list[tuple[str, float, tuple[str, ...]]] = [
         ("demo, state age 20 ms", 0.01, ()),
@@ -88,22 +91,19 @@ def flights(base: Path, quick: bool) -> list[tuple[str, str, str]]:
         ("bundled vehicle (1 kg, D = 1 1/s), paper's path", 0.03, ("--flight", "eight")),
         ("the same, 2.5 times as fast", 0.03, ("--flight", "eight", "--time-scale", "2.5")),
     ]
-    rows = []
     for i, (name, limit, options) in enumerate(cases[: 1 if quick else None]):
         s = demo(base / f"flight-{i}", *options)
         rms = s["position_rms_m"]
-        rows.append((f"{name}: position_rms_m", f"<= {limit:g}", "not settled" if rms is None else f"{rms:.4f}"))
+        yield f"{name}: position_rms_m", f"<= {limit:g}", "not settled" if rms is None else f"{rms:.4f}"
         if i == 0:
             truth = (1.0, 0.0, 0.4905)
             off = max(abs(a - b) for a, b in zip(s["disturbance_m_s2"], truth, strict=True)) / 1.114
-            rows.append(("  disturbance, off the truth by", "<= 3 %", f"{100 * off:.2f} %"))
-            rows.append(("  body v_y once settled, rms", "<= 0.05 m/s", f"{s['body_sideways_rms_m_s']:.4f} m/s"))
-    return rows
+            yield "  disturbance, off the truth by", "<= 3 %", f"{100 * off:.2f} %"
+            yield "  body v_y once settled, rms", "<= 0.05 m/s", f"{s['body_sideways_rms_m_s']:.4f} m/s"
 
 
-def wind(base: Path) -> list[tuple[str, str, str]]:
+def wind(base: Path) -> Iterator[Row]:
     """The published test in wind, by the law, and by PX4's own position controller for comparison."""
-    rows = []
     for speed_m_s, limit in ((0.0, 0.050), (8.5, 0.077), (12.0, 0.123)):
         blows = f"{-speed_m_s:g},0,0" if speed_m_s else "0,0,0"
         by_law = f"figure of eight in {speed_m_s:g} m/s of wind"
@@ -111,11 +111,10 @@ def wind(base: Path) -> list[tuple[str, str, str]]:
             folder = base / f"wind-{speed_m_s:g}-{controller}"
             s = demo(folder, "--flight", "windtest", "--wind", blows, "--controller", controller)
             rms, tilt = s["position_rms_m"], s["tilt_max_rad"]
-            rows.append((f"{name}: position_rms_m", reach, f"{rms:.4f} (tilt to {tilt:.2f} rad)"))
-    return rows
+            yield f"{name}: position_rms_m", reach, f"{rms:.4f} (tilt to {tilt:.2f} rad)"
 
 
-def speeds(base: Path, repeats: int) -> list[tuple[str, str, str]]:
+def speeds(base: Path, repeats: int) -> Iterator[Row]:
     """Lockstep flights with either engine, in turn; and the same seed twice."""
     engines = ["python", *(["numba"] if accelerate.available() else [])]
     found: dict[str, list[float]] = {engine: [] for engine in engines}
@@ -127,16 +126,14 @@ def speeds(base: Path, repeats: int) -> list[tuple[str, str, str]]:
             found[engine].append(speed(folder))
             if engine == "python":
                 summaries.append(without_wall_clock({k: v for k, v in summary.items() if k != "folder"}))
-    rows = []
     for engine, reach in (("python", 10), ("numba", 20)):
         if engine in found:
             values = found[engine]
             text = f"{statistics.median(values):.1f} (of {len(values)}: {min(values):.1f} to {max(values):.1f})"
-            rows.append((f"lockstep at 250 Hz, times real time, {engine}", f">= {reach}", text))
+            yield f"lockstep at 250 Hz, times real time, {engine}", f">= {reach}", text
     if len(summaries) > 1:
         same = all(s == summaries[0] for s in summaries)
-        rows.append(("same seed, same summary", "identical", "identical" if same else "DIFFERENT"))
-    return rows
+        yield "same seed, same summary", "identical", "identical" if same else "DIFFERENT"
 
 
 def median_us(call: Callable[[int], object], count: int = 4000) -> float:
@@ -151,12 +148,11 @@ def median_us(call: Callable[[int], object], count: int = 4000) -> float:
     return statistics.median(times) * 1e-3
 
 
-def steps() -> list[tuple[str, str, str]]:
+def steps() -> Iterator[Row]:
     """The control step: the law with its prediction, and the whole step with reference and conversion around it."""
     vehicle = load_flight("paper").vehicle
     course = Course(load("paper"), vehicle, (0.0, 0.0, -10.0), 0.0, None)
     state = State((0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1))
-    rows = []
     for engine, reach in (("python", 40), ("numba", 5)):
         if engine == "numba" and not accelerate.available():
             continue
@@ -170,12 +166,11 @@ def steps() -> list[tuple[str, str, str]]:
             return a.step(state, r, 46.0, p, False, True, 0.004)
 
         law = median_us(law_step)
-        rows.append((f"control step with prediction, median, {engine}", f"< {reach} us", f"{law:.1f} us"))
-        rows.append(("  with reference, history and conversion", "", f"{whole:.1f} us"))
-    return rows
+        yield f"control step with prediction, median, {engine}", f"< {reach} us", f"{law:.1f} us"
+        yield "  with reference, history and conversion", "", f"{whole:.1f} us"
 
 
-def machine() -> list[tuple[str, str, str]]:
+def machine() -> Iterator[Row]:
     """What times below can be put in relation to: pymavlink's parse of one ODOMETRY, and a loop of plain arithmetic."""
     library = codec.dialect()
     message = library.MAVLink_odometry_message(
@@ -190,17 +185,12 @@ def machine() -> list[tuple[str, str, str]]:
             x = 0.5 * x + i
         return x
 
-    return [
-        (
-            "this machine: pymavlink parses one ODOMETRY, median",
-            "",
-            f"{median_us(lambda i: parser.parse_buffer(frame)):.1f} us",
-        ),
-        ("this machine: 100 rounds of x = 0.5 x + i, median", "", f"{median_us(arithmetic):.1f} us"),
-    ]
+    parsed = f"{median_us(lambda i: parser.parse_buffer(frame)):.1f} us"
+    yield "this machine: pymavlink parses one ODOMETRY, median", "", parsed
+    yield "this machine: 100 rounds of x = 0.5 x + i, median", "", f"{median_us(arithmetic):.1f} us"
 
 
-def planning(repeats: int) -> list[tuple[str, str, str]]:
+def planning(repeats: int) -> Iterator[Row]:
     """A path through 500 waypoints, planned with its times and checked as before a flight."""
     vehicle = load_flight("eight").vehicle
     limits = plan_limits(vehicle, wind_m_s=1.0)
@@ -223,7 +213,7 @@ def planning(repeats: int) -> list[tuple[str, str, str]]:
     text = f"{statistics.median(both):.2f} s of {repeats} (plan alone {statistics.median(planned):.2f} s)"
     if violations:
         text += f", {violations} VIOLATIONS"
-    return [("500 waypoints planned, timed and checked, median", "< 2 s", text)]
+    yield "500 waypoints planned, timed and checked, median", "< 2 s", text
 
 
 class Lossy:
@@ -251,7 +241,7 @@ def upload(port: int, content: bytes, loss: float, seed: int) -> tuple[float, bo
     return arrived[-1], (verdict.size_bytes, verdict.crc32) == (len(content), crc32(content))
 
 
-def transfers(base: Path, repeats: int) -> list[tuple[str, str, str]]:
+def transfers(base: Path, repeats: int) -> Iterator[Row]:
     """Uploads to `companion serve` over loopback; the file's check, which follows, is not counted."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
@@ -262,7 +252,6 @@ def transfers(base: Path, repeats: int) -> list[tuple[str, str, str]]:
         vehicle_port, port = int(vehicle.getsockname()[1]), int(ground.getsockname()[1])
     command = [sys.executable, "-m", "companion", "serve", "--vehicle", "paper", "--folder", str(base / "stored")]
     command += ["--connect", f"udpin:127.0.0.1:{vehicle_port}", "--ground", f"udpin:127.0.0.1:{port}"]
-    rows = []
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=base)
     try:
         for loss, reach in ((0.0, "< 3 s, intact"), (0.1, "complete, intact")):
@@ -273,14 +262,13 @@ def transfers(base: Path, repeats: int) -> list[tuple[str, str, str]]:
                 taken.append(time_s)
                 intact = intact and same
             text = f"{statistics.median(taken):.2f} s of {repeats}, {'intact' if intact else 'DAMAGED'}"
-            rows.append((f"1 MB uploaded over loopback, {100 * loss:.0f} % loss each way, median", reach, text))
+            yield f"1 MB uploaded over loopback, {100 * loss:.0f} % loss each way, median", reach, text
     finally:
         process.terminate()
         process.wait(timeout=20)
-    return rows
 
 
-def recording(base: Path) -> list[tuple[str, str, str]]:
+def recording(base: Path) -> Iterator[Row]:
     """What recording costs a control step (the datagrams to the recorder, the row to the record and to the recorder),
     and what an hour of flight leaves in memory."""
     row = np.random.default_rng(1).normal(size=len(COLUMNS))
@@ -308,20 +296,12 @@ def recording(base: Path) -> list[tuple[str, str, str]]:
     parse = median_us(lambda _: parser.parse_buffer(raw))
     cost, nothing = median_us(one_step), median_us(lambda _: None)
     recorder.close()
+    taken = f"{cost - nothing:.2f} us, {(cost - nothing) / parse:.2f} of the parse of one ODOMETRY"
+    yield "recording: state, setpoint and row of a step, median", "< 5 us", taken
     before, after = _an_hour(base / "hour", state, row)
     growth = [(b - a) / 1024.0 for a, b in zip(before, after, strict=True)]
-    return [
-        (
-            "recording: state, setpoint and row of a step, median",
-            "< 5 us",
-            f"{cost - nothing:.2f} us, {(cost - nothing) / parse:.2f} of the parse of one ODOMETRY",
-        ),
-        (
-            "memory after an hour of flight, control side / recorder",
-            "< 10 MB more",
-            f"{growth[0]:+.1f} MB / {growth[1]:+.1f} MB",
-        ),
-    ]
+    text = f"{growth[0]:+.1f} MB / {growth[1]:+.1f} MB"
+    yield "memory after an hour of flight, control side / recorder", "< 10 MB more", text
 
 
 def _an_hour(folder: Path, state: Callable[[int], bytes], row: Any) -> tuple[list[int], list[int]]:
@@ -360,7 +340,7 @@ def _resident_kb(pid: int) -> int:
     return int(next(line for line in lines if line.startswith("VmRSS")).split()[1])
 
 
-def opening(base: Path) -> list[tuple[str, str, str]]:
+def opening(base: Path) -> Iterator[Row]:
     """How long a report of ten minutes takes to open in a real browser."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "unit"))
     from chromium import Chromium, installed
@@ -368,7 +348,8 @@ def opening(base: Path) -> list[tuple[str, str, str]]:
 
     program = installed()
     if program is None:
-        return [("report of a 10-minute flight, opened in chromium", "< 3 s", "chromium is not installed")]
+        yield "report of a 10-minute flight, opened in chromium", "< 3 s", "chromium is not installed"
+        return
     record = synthetic_flight(600.0)
     folder = base / "long"
     folder.mkdir(parents=True)
@@ -377,21 +358,35 @@ def opening(base: Path) -> list[tuple[str, str, str]]:
         browser.size(1200, 900)
         seen = sorted(browser.open(page) for _ in range(3))
     size = f"{page.stat().st_size / 1e6:.1f} MB"
-    return [("report of a 10-minute flight, opened in chromium", "< 3 s, < 8 MB", f"{seen[1]:.2f} s, {size}")]
+    yield "report of a 10-minute flight, opened in chromium", "< 3 s, < 8 MB", f"{seen[1]:.2f} s, {size}"
 
 
-def groups(base: Path, quick: bool) -> dict[str, Callable[[], list[tuple[str, str, str]]]]:
+def steps_here() -> Iterator[Row]:
+    """The control step, with what the machine was like then."""
+    yield from steps()
+    yield next(machine())
+
+
+class Group(NamedTuple):
+    """Figures that are measured together."""
+
+    about_s: tuple[int, int]
+    """How long it takes, roughly, with --quick and without [s]: on two cores on which a demo takes 8 s."""
+    measure: Callable[[], Iterator[Row]]
+
+
+def groups(base: Path, quick: bool) -> dict[str, Group]:
     """What can be measured, in the order in which it is."""
     return {
-        "machine": machine,
-        "steps": lambda: steps() + machine()[:1],
-        "planning": lambda: planning(2 if quick else 7),
-        "transfers": lambda: transfers(base, 1 if quick else 5),
-        "speeds": lambda: speeds(base, 1 if quick else 3),
-        "flights": lambda: flights(base, quick),
-        "wind": lambda: [] if quick else wind(base),
-        "recording": lambda: recording(base),
-        "opening": lambda: opening(base),
+        "machine": Group((1, 1), machine),
+        "steps": Group((5, 5), steps_here),
+        "planning": Group((3, 10), lambda: planning(2 if quick else 7)),
+        "transfers": Group((5, 15), lambda: transfers(base, 1 if quick else 5)),
+        "speeds": Group((20, 60), lambda: speeds(base, 1 if quick else 3)),
+        "flights": Group((10, 60), lambda: flights(base, quick)),
+        "wind": Group((0, 60), lambda: iter(()) if quick else wind(base)),
+        "recording": Group((90, 90), lambda: recording(base)),
+        "opening": Group((15, 15), lambda: opening(base)),
     }
 
 
@@ -405,11 +400,19 @@ def main() -> None:
         base = arguments.out or Path(temporary)
         base.mkdir(parents=True, exist_ok=True)
         measured = groups(base, arguments.quick)
-        rows = [row for name in arguments.only or measured for row in measured[name]()]
-    print(f"Python {platform.python_version()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
-    print("| figure | reach | seen |\n|---|---|---|")
-    for row in rows:
-        print(f"| {' | '.join(row)} |")
+        wanted = {name: measured[name] for name in arguments.only or measured}
+        times = {name: group.about_s[0 if arguments.quick else 1] for name, group in wanted.items()}
+        print(f"Python {platform.python_version()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+        print(
+            f"takes about {sum(times.values()) / 60.0:.1f} min where a demo takes 8 s, longer where it takes longer\n"
+        )
+        print("| figure | reach | seen |\n|---|---|---|", flush=True)
+        for name, group in wanted.items():
+            begin = time.monotonic()
+            print(f"{name}: about {times[name]} s ...", file=sys.stderr, flush=True)
+            for row in group.measure():
+                print(f"| {' | '.join(row)} |", flush=True)
+            print(f"{name}: {time.monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
