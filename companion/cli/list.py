@@ -30,9 +30,9 @@ def run(
     if not stored:
         print("no trajectories are stored")
         return
-    table = Table("number", "name", "bytes", "CRC-32", "", "verdict", box=box.SIMPLE)
+    table = Table("number", "name", "bytes", "CRC-32", "verdict", box=box.SIMPLE)
     for file in stored:
-        word = {True: "may fly", False: "REFUSED", None: "unchecked"}[file.accepted]
-        cells = (str(file.id), file.name, str(file.size_bytes), f"{file.crc32:08x}", word, file.verdict)
+        word = {True: "", False: "REFUSED: ", None: "not checked: "}[file.accepted]  # what may fly says so itself
+        cells = (str(file.id), file.name, str(file.size_bytes), f"{file.crc32:08x}", word + file.verdict)
         table.add_row(*(Text(cell) for cell in cells))
     Console(highlight=False).print(table)

@@ -41,14 +41,20 @@ def operate(
     """
     from dataclasses import asdict
 
+    from companion.errors import CompanionError
     from companion.ground.client import Client
 
     with Client(to, timeout_s, key) as client:
+        refusal = ""
         try:
             act(client)
+        except CompanionError as error:
+            refusal = str(error)
+            raise
         finally:
             for announcement in client.texts:
-                say(f"  {announcement.text}", quiet=as_json)
+                if announcement.text != refusal:  # which is said by itself
+                    say(f"  {announcement.text}", quiet=as_json)
         if as_json:
             print(json.dumps({"done": what, **asdict(client.status())}, indent=2))
         else:

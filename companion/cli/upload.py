@@ -1,17 +1,19 @@
 """The vehicle checks the file itself before it takes it, and says why not when it does not (exit code 3); what it had
 under that name stays then. An upload that was cut off goes on where it ended when it is made again.
+
+A file that names another program's goes as one that holds its text; so does another program's file with --frame or
+--laps, as NAME.toml.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.common import JsonOption, say
+from companion.cli.common import FrameOption, JsonOption, LapsOption, frame_named, say
 from companion.cli.operate import TO_DEFAULT, KeyOption, ToOption
 
 if TYPE_CHECKING:
@@ -33,6 +35,8 @@ def run(
         str | None,
         typer.Option("--name", metavar="NAME", help="What to call it there; default: its own name."),
     ] = None,
+    frame: FrameOption = None,
+    laps: LapsOption = None,
     system: SystemOption = None,
     timeout: Annotated[
         float, typer.Option("--timeout", metavar="S", min=1.0, help="How long the vehicle's check may take.")
@@ -43,11 +47,11 @@ def run(
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
-    from companion.config import find
     from companion.errors import ExitCode
     from companion.ground.upload import Files
+    from companion.trajectory.portable import Portable
 
-    path = find(file, "trajectories")
+    brought = Portable(file, frame_named(frame), laps)
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     with (
         Files(to, system=system, key=key) as files,
@@ -61,7 +65,9 @@ def run(
             else:
                 bar.update(task, completed=there, total=total)
 
-        verdict = files.upload(Path(path), name, progress=show, verdict_patience_s=timeout)
+        verdict = files.upload_bytes(
+            brought.content, name or brought.file_name, progress=show, verdict_patience_s=timeout
+        )
     if as_json:
         print(json.dumps(verdict._asdict(), indent=2))
     else:

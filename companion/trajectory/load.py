@@ -54,7 +54,7 @@ def load(
 
     """
     path = find(str(name), "trajectories")
-    table = _flown(_table_of(path, frame), None, laps)
+    table = changed(_table_of(path, frame), None, laps)
     called = shown(str(path))
     other = table.get("file") if path.suffix.lower() == ".toml" else None
     if confined and isinstance(other, str) and Path(other).parent != path.parent.absolute():
@@ -231,10 +231,10 @@ def embedded(flight: Flight, time_scale: float | None = None, laps: int | None =
     """
     named = flight.trajectory
     table = table_of(named) if isinstance(named, str) else _pinned(dict(named))
-    return flight.model_copy(update={"trajectory": _flown(table, time_scale, laps)})
+    return flight.model_copy(update={"trajectory": changed(table, time_scale, laps)})
 
 
-def _flown(table: dict[str, Any], time_scale: float | None, laps: int | None) -> dict[str, Any]:
+def changed(table: dict[str, Any], time_scale: float | None, laps: int | None) -> dict[str, Any]:
     """Return the table with another pace and number of laps; None leaves what it says."""
     if time_scale is not None:
         table = {**table, "time_scale": time_scale}

@@ -278,7 +278,7 @@ def test_the_commands(server, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == "good.csv: REFUSED by the vehicle: good.csv: asks for too much\n"
     assert main(["list"]) == 0
     out = capsys.readouterr().out
-    assert "good.csv" in out and "paper.toml" in out and "may fly" in out
+    assert "good.csv" in out and "paper.toml" in out and "may be flown" in out
     assert main(["remove", "good.csv"]) == 0
     assert main(["remove", "good.csv"]) == 2
     assert "no such file" in capsys.readouterr().err

@@ -1,0 +1,47 @@
+"""A trajectory as one file that says all there is to say: for a vehicle that has only this file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tomlkit
+
+from companion.config import find
+from companion.frames import Frame
+from companion.trajectory.formats.reading import decoded, read_bytes, shown
+from companion.trajectory.load import changed, table_of
+
+
+class Portable:
+    """A trajectory file as it goes to the vehicle."""
+
+    def __init__(self, name: str, frame: Frame | None = None, laps: int | None = None) -> None:
+        """Read it.
+
+        A file of ours that names another program's takes that file's text in; so does one that is made around another
+        program's file where something has to be said about it. Every other file goes as it is.
+
+        Args:
+            name: a path, or the name of a bundled trajectory.
+            frame: of another program's file, where its format leaves that open.
+            laps: replaces the file's.
+
+        Raises:
+            InputError: no such file, or it cannot be read.
+        """
+        path = find(name, "trajectories")
+        self.file_name = path.name
+        """What to call it there."""
+        ours = path.suffix.lower() == ".toml"
+        table = table_of(name, frame) if ours or frame is not None or laps is not None else {}
+        if not ("file" in table or (ours and laps is not None)):
+            self.content = read_bytes(path, shown(str(path)))
+            return
+        table = changed(table, None, laps)
+        if "file" in table:
+            other = Path(table.pop("file"))
+            table.pop("sha256", None)
+            called = shown(str(other))
+            table["text"] = decoded(read_bytes(other, called), called).text
+        self.file_name = path.with_suffix(".toml").name
+        self.content = tomlkit.dumps(table).encode()
