@@ -23,7 +23,8 @@ class Following:
     """
 
     def __init__(self, lag_s: Vec3) -> None:
-        self._lag_s = lag_s[:2]
+        roll_s, pitch_s, _ = lag_s
+        self._lag_s = max(roll_s, _EPSILON_S), max(pitch_s, _EPSILON_S)
         self._sent: deque[tuple[float, float, float]] = deque(maxlen=_COMMANDS_MAX)
         """Commands that do not act yet: stamp of their state [s], roll and pitch rate [rad/s]."""
         self._acting: tuple[float, float] | None = None
@@ -50,15 +51,15 @@ class Following:
         if self._acting is None:
             self._model = rates[0], rates[1]
         else:
-            past_s = t_s - last_s
-            roll, pitch = (
-                target + (now - target) * math.exp(-past_s / max(lag, _EPSILON_S))
-                for now, target, lag in zip(self._model, self._acting, self._lag_s, strict=True)
-            )
+            past_s = last_s - t_s
+            (roll, pitch), (to_roll, to_pitch), (roll_s, pitch_s) = self._model, self._acting, self._lag_s
+            roll = to_roll + (roll - to_roll) * math.exp(past_s / roll_s)
+            pitch = to_pitch + (pitch - to_pitch) * math.exp(past_s / pitch_s)
             self._model = roll, pitch
             off = math.hypot(rates[0] - roll, rates[1] - pitch)
-        self._sent.append((t_s, commanded[0], commanded[1]))
-        while self._sent and self._sent[0][0] + delay_s <= t_s + _EPSILON_S:
-            _, roll, pitch = self._sent.popleft()
+        sent, acts_s = self._sent, t_s + _EPSILON_S - delay_s
+        sent.append((t_s, commanded[0], commanded[1]))
+        while sent and sent[0][0] <= acts_s:
+            _, roll, pitch = sent.popleft()
             self._acting = roll, pitch
         return off

@@ -577,6 +577,7 @@ class FlightLoop:
 
     def _account(self) -> None:
         """Records and judges the last step: after its setpoint is out, and while a vehicle in lockstep moves on."""
+        self._wire.tell()  # the log wants a step's traffic before its row
         step, self._unaccounted = self._unaccounted, None
         if step is None:
             return

@@ -175,6 +175,7 @@ class Control:
         outcome = loop.run()
         outcome.refused_messages = refused_since(self._wire.refusals, refused_before)
         ready.note_outcome(outcome)
+        self._wire.tell()
         self._recorder = None
         self._loop = None
         self._standby.autopilot = replace(loop.autopilot)

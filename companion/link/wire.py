@@ -30,7 +30,7 @@ from companion.link.transport import Address, Transport, open_transport
 
 Tap = Callable[[int, bytes, int], object]
 """Called with direction, raw frame and `time.monotonic_ns()` for every frame used or sent, and unknown ones; not for
-those that carry a key."""
+those that carry a key. In the order of the traffic, but only when the wire has nothing to do (`Wire.tell`)."""
 
 TAP_IN: Final = 0
 TAP_OUT: Final = 3  # the numbers that a traffic log (.tlog) has for the directions
@@ -40,6 +40,8 @@ _AUTOPILOT_COMPONENT: Final = 1
 _READS_MAX = 256
 _DATAGRAM_MAX = 1400
 """Several frames in one datagram stay within what a network takes whole."""
+_UNTOLD_MAX = 1000
+"""What waits for the tap is bounded, also for somebody who only sends."""
 _UNHEARD_NS: Final = 1_000_000_000
 _GREET_NS: Final = 500_000_000
 
@@ -70,6 +72,8 @@ class Wire:
         """Who else sent to our port, if anybody, for the explanation of a silent vehicle."""
         self._transport = transport
         self._tap = tap
+        self._untold: list[tuple[int, bytes, int]] = []
+        """What the tap has not been shown yet."""
         self._guard = guard
         self._formats = message_formats()
         self._parser = FrameParser(self._formats, self.counters, guard)
@@ -148,6 +152,8 @@ class Wire:
         Raises:
             LinkError: the serial line is gone.
         """
+        if self._untold:
+            self.tell()
         if self._kept:
             kept, self._kept = self._kept, []
             return kept
@@ -160,7 +166,7 @@ class Wire:
                 if not self._read(frames, unknown):
                     break
         if self._tap is not None:
-            self._report(frames, unknown)
+            self._note(frames, unknown)
         return frames
 
     def keep(self, frames: list[Frame]) -> None:
@@ -254,15 +260,26 @@ class Wire:
         elif self._guard is not None:
             self._greet(None, wall_ns)
 
-    def _report(self, frames: list[Frame], unknown: list[bytes]) -> None:
-        """Show the tap what came."""
-        assert self._tap is not None
+    def _note(self, frames: list[Frame], unknown: list[bytes]) -> None:
+        """Keep what came for the tap."""
+        untold = self._untold
         for frame in frames:
             if frame.msgid != SETUP_SIGNING:  # carries a key
-                self._tap(TAP_IN, frame.raw, frame.arrival_wall_ns)
-        wall_ns = time.monotonic_ns()
-        for raw in unknown:
-            self._tap(TAP_IN, raw, wall_ns)
+                untold.append((TAP_IN, frame.raw, frame.arrival_wall_ns))
+        if unknown:
+            wall_ns = time.monotonic_ns()
+            untold += [(TAP_IN, raw, wall_ns) for raw in unknown]
+
+    def tell(self) -> None:
+        """Show the tap what came and went since the last time.
+
+        Whoever answers in a hurry calls it after the answer; otherwise the next `receive` does, or `close`.
+        """
+        tap, untold = self._tap, self._untold
+        if tap is not None:
+            for entry in untold:
+                tap(*entry)
+        untold.clear()
 
     def send(self, msgid: int, payload: bytes) -> bool:
         """Frame a payload and hand it to the system without waiting. False, and counted, when it did not go out.
@@ -282,7 +299,9 @@ class Wire:
         self._seq = (self._seq + 1) & 0xFF
         self.counters.sent += 1
         if self._tap is not None and msgid != SETUP_SIGNING:
-            self._tap(TAP_OUT, raw, time.monotonic_ns())
+            self._untold.append((TAP_OUT, raw, time.monotonic_ns()))
+            if len(self._untold) > _UNTOLD_MAX:
+                self.tell()
         return True
 
     def gather(self) -> None:
@@ -340,6 +359,7 @@ class Wire:
 
     def close(self) -> None:
         """Close the link."""
+        self.tell()
         self._transport.close()
         if self._owned is not None:
             self._owned.close()

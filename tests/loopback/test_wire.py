@@ -310,6 +310,8 @@ def test_the_tap_sees_both_directions():
         frames = collect(wire, 2)
         wire.send(0, codec.encode_heartbeat())
         sent = vehicle.recv(300)
+        assert seen == []  # nobody's answer waits for the log
+        wire.tell()
         assert [(direction, raw) for direction, raw, _ in seen] == [
             (TAP_IN, heartbeat(1)),
             (TAP_IN, heartbeat(2)),
@@ -318,6 +320,17 @@ def test_the_tap_sees_both_directions():
         ]
         assert seen[0][2] == frames[0].arrival_wall_ns
         assert [stamp for *_, stamp in seen] == sorted(stamp for *_, stamp in seen)
+
+
+def test_what_the_tap_was_not_told_it_is_told_at_the_next_look_and_at_the_end():
+    seen: list[tuple[int, bytes, int]] = []
+    with listening(tap=lambda *entry: seen.append(entry)) as (wire, address), udp_socket() as vehicle:
+        vehicle.sendto(heartbeat(1), address)
+        collect(wire, 1)
+        wire.receive(0.0)
+        assert [direction for direction, *_ in seen] == [TAP_IN]
+        wire.send(0, codec.encode_heartbeat())
+    assert [direction for direction, *_ in seen] == [TAP_IN, TAP_OUT]
 
 
 # ---- opening ----

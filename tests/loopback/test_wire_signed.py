@@ -156,6 +156,7 @@ def test_what_is_sent_is_signed_and_a_key_is_never_taped(wire, voice, key, taped
     sent = vehicle.hears()
     assert sent is not None
     assert vehicle.signer.verify(sent, codec.HEARTBEAT, True)
+    wire.tell()
     assert [way for way, _ in taped] == [TAP_IN, TAP_OUT]
     assert not any(secret in raw for _, raw in taped)
 
