@@ -311,13 +311,19 @@ class Output(Section):
     controller: Literal["law", "px4", "calibration"] = "law"
     """"px4": the reference itself is sent and PX4's own position controller follows it; then `kind` means nothing.
     "calibration": a cautious hover and the manoeuvres of [calibration]; `companion calibrate` flies it."""
-    kind: Literal["rates", "attitude", "actuators"] = "rates"
-    """What the law sends."""
+    kind: Literal["auto", "rates", "attitude", "actuators"] = "auto"
+    """What the law sends. "auto": rates, or attitude where the loop as it is measured before the flight asks for it
+    (`flight.schedule`)."""
+
+    @property
+    def by_law(self) -> Literal["rates", "attitude", "actuators"]:
+        """What the law sends unless something else is chosen before the flight."""
+        return "rates" if self.kind == "auto" else self.kind
 
     @property
     def sends(self) -> Literal["rates", "attitude", "actuators", "position"]:
         """The setpoints that go to the autopilot."""
-        return "position" if self.controller == "px4" else self.kind
+        return "position" if self.controller == "px4" else self.by_law
 
 
 class CalibrationFlight(Section):

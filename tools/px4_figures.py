@@ -2,6 +2,7 @@
 prints how well they were tracked.
 
     python tools/px4_figures.py --px4 BINARY [--rows ROW ...] [--controllers law px4] [--set KEY=VALUE ...]
+    python tools/px4_figures.py --px4 BINARY --calibrate KG     the same with what `companion calibrate` finds first
 
 BINARY is what PX4's own build makes: build/px4_sitl_default/bin/px4. PX4 is started once, with its simulated vehicle
 SIH, and flies all rows one after the other; it is stopped at the end. Errors are against PX4's own estimate, from 20 s
@@ -145,6 +146,23 @@ def step_response(folder: Path, at_s: float) -> dict[str, float | None]:
     return {"peak_m": float(error[after].max()), "back_s": float(t[beyond[-1]]) if len(beyond) else 0.0}
 
 
+def calibrate(session: Session, vehicle: str, mass_kg: float, out: Path) -> Path:
+    """Calibrates the vehicle with a mass that is entered; returns the vehicle file that was found.
+
+    Raises:
+        RuntimeError: nothing was found.
+    """
+    found = out / "found.toml"
+    command = [*(sys.executable, "-m", "companion", "calibrate", "--mass", f"{mass_kg:g}", "--vehicle", vehicle)]
+    command += [*("--simulator", "--connect", session.connection, "--timeout", "30")]
+    command += [*("--out", str(out / "calibration"), "--save", str(found))]
+    with (out / "calibration.log").open("wb") as log:
+        code = subprocess.run(command, stdout=log, stderr=log, check=False, timeout=FLIGHT_S + 60.0).returncode
+    if code != 0 or not found.is_file():
+        raise RuntimeError(f"no calibration: {out}/calibration.log")
+    return found
+
+
 def fly(session: Session, row: Row, words: list[str], folder: Path) -> dict[str, Any]:
     """One flight, from wherever the vehicle is; returns its summary with what the simulator knows."""
     session.wind(row.wind_m_s, 0.0)
@@ -260,6 +278,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
     parser.add_argument("--controllers", nargs="+", choices=["law", "px4"], default=["law", "px4"])
     parser.add_argument("--vehicle", default="px4_sih", help="vehicle file; the same for all rows")
+    parser.add_argument("--calibrate", type=float, metavar="KG", help="first, with this mass; then fly what was found")
     parser.add_argument("--output", default="rates", choices=["rates", "attitude"])
     parser.add_argument(
         "--set", nargs="+", default=[], metavar="KEY=VALUE", help="of the vehicle file, for experiments"
@@ -274,7 +293,6 @@ def main() -> int:
     """Exit code 0: everything was reached."""
     options = arguments()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # PX4 is stopped on the way out
-    vehicle = merged(read_toml(find(options.vehicle, "vehicles")), nested(options.set))
     out = options.out or Path("flights") / datetime.now(UTC).strftime("px4-%Y%m%dT%H%M%SZ")
     out = out.absolute()
     parameters = dict(setting.split("=", 1) for setting in options.px4_set)
@@ -282,6 +300,10 @@ def main() -> int:
     short = False
     with Session(options.px4.absolute(), out / "px4", parameters) as session:
         session.wait_until_ready()
+        file = options.vehicle
+        if options.calibrate is not None:
+            file = str(calibrate(session, file, options.calibrate, out))
+        vehicle = merged(read_toml(find(file, "vehicles")), nested(options.set))
         print(HEAD, file=sys.stderr if options.json else sys.stdout, flush=True)
         for name in options.rows:
             row = ROWS[name]

@@ -21,6 +21,7 @@ from companion.control import flat
 from companion.control.output import thrust_of
 from companion.control.types import State
 from companion.errors import InputError
+from companion.flight.adaptation import adapted
 from companion.flight.controller import controller_of
 from companion.flight.course import ZERO, Course
 from companion.flight.phases import Engagement
@@ -111,6 +112,8 @@ def replay(
     engagement = _engagement(source)
     if not len(record):
         raise InputError(f"{source.path}: the record is empty, the flight was never engaged")
+    if changed is None:
+        flight = adapted(flight, engagement.adaptation)
     trajectory = of_flight(flight)
     course = Course(trajectory, flight.vehicle, engagement.hold_point_m, engagement.yaw_rad, engagement.home_m)
     for ramp in engagement.ramps:

@@ -143,12 +143,12 @@ def fly_sampled(
     vehicle = flight.vehicle
     position, yaw = start_of(flight)
     sim = simulated_vehicle(flight) if real is None else real
-    px4 = "1.13" if flight.output.kind == "actuators" else "1.18"
+    px4 = "1.13" if flight.output.by_law == "actuators" else "1.18"
     airframe = Airframe(
         sim, simulated_world(flight), seed=flight.world.seed, engine=compiled.engine, start=(position, yaw), px4=px4
     )
     course = Course(trajectory, vehicle, position, yaw, (0.0, 0.0, 0.0))
-    tracker = Tracker(vehicle, flight.output.kind, compiled)
+    tracker = Tracker(vehicle, flight.output.by_law, compiled)
     n_steps = max(1, round(sim.loop_rate_hz / vehicle.link.state_rate_hz))
     interval_us = n_steps * airframe.dt_us
     count = int(min(course.duration_s, duration_max_s) * 1e6 / interval_us)

@@ -279,7 +279,7 @@ def _check_whole(study: Study) -> None:
                     f"{source}: slices[{index}].{axis} = {name!r}: must be a number that is varied"
                     f" ({', '.join(numbers) or 'none is'})"
                 )
-    if study.flight.output.controller != "law" or study.flight.output.kind == "actuators":
+    if study.flight.output.controller != "law" or study.flight.output.by_law == "actuators":
         raise InputError(
             f"{source}: flight = {file.flight!r}: a campaign flies the law with output.kind"
             ' = "rates" or "attitude", and this flight does not'

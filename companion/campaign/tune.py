@@ -29,7 +29,7 @@ from companion.config import Vehicle
 from companion.control.certificate import certify
 from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S, margins
 from companion.errors import CompanionError, RefusedError
-from companion.flight.preflight import timing
+from companion.flight.loop_margins import timing
 
 FloatArray = NDArray[np.float64]
 

@@ -200,8 +200,8 @@ def memory_of(vehicle: Vehicle, clock: Clock) -> tuple[Memory, FloatArray]:
 def _setup(case: Case, sim: VehicleFile, clock: Clock, memory: Memory) -> Setup:
     flight, vehicle = case.flight, case.flight.vehicle
     world = flight.world
-    by_attitude = flight.output.kind == "attitude"
-    if flight.output.controller != "law" or flight.output.kind == "actuators":
+    by_attitude = flight.output.by_law == "attitude"
+    if flight.output.controller != "law" or flight.output.by_law == "actuators":
         raise InputError(
             f"flight {flight.name!r}: output: a campaign flies the law, with rates or attitudes; change [output]"
         )

@@ -20,6 +20,9 @@ def run(
         typer.Option("--trajectory", metavar="NAME", help="Predict this trajectory instead of the flight's."),
     ] = None,
     frame: FrameOption = None,
+    output: Annotated[
+        str | None, typer.Option("--output", help='Over "rates" or "attitude" setpoints; default: the flight\'s.')
+    ] = None,
     start: Annotated[
         str | None, typer.Option("--start", metavar="N,E,D", help="Predict from here instead of the flight's [start].")
     ] = None,
@@ -29,20 +32,21 @@ def run(
     """Prints certificate, margins and predicted extremes of a configuration."""
     from companion.campaign.predict import Extreme, bounds, gate_prediction
     from companion.control.certificate import certify, disturbance_overcome
-    from companion.control.sampled import margins
     from companion.errors import CompanionError, ExitCode
-    from companion.flight.preflight import gate_gains, gate_reference, timing
+    from companion.flight.loop_margins import loop_margins, timing
+    from companion.flight.preflight import gate_gains, gate_reference
     from companion.flight.tracker import kernels
     from companion.trajectory.load import of_flight
 
-    flight = _flight(config, trajectory_changes(trajectory, frame), start, time_scale)
+    flight = _flight(config, trajectory_changes(trajectory, frame), start, time_scale, output)
     vehicle = flight.vehicle
     parameters = vehicle.parameters()
     certificate = certify(parameters.gains, parameters.model.drag)
-    found = margins(parameters, timing(vehicle))
+    found = loop_margins(vehicle, flight.output.by_law)
     document: dict[str, Any] = {
         "vehicle": vehicle.name,
         "drag_1_s": parameters.model.drag,
+        "output": flight.output.by_law,
         "eigenvalues": {
             "q_estimator_on": certificate.inside,
             "q_estimator_off": certificate.inside_frozen,
@@ -61,7 +65,7 @@ def run(
     }
     refusals: list[str] = []
     try:
-        gate_gains(vehicle)
+        gate_gains(vehicle, flight.output.by_law)
     except CompanionError as error:
         refusals.append(str(error))
     if flight.trajectory:
@@ -87,7 +91,7 @@ def run(
         raise typer.Exit(int(ExitCode.REFUSED))
 
 
-def _flight(config: str, given: dict[str, Any], start: str | None, time_scale: float | None) -> Any:
+def _flight(config: str, given: dict[str, Any], start: str | None, time_scale: float | None, output: str | None) -> Any:
     """The flight of a flight file; of a vehicle file one without a trajectory, unless one is given."""
     from pathlib import Path
 
@@ -98,6 +102,8 @@ def _flight(config: str, given: dict[str, Any], start: str | None, time_scale: f
     is_flight = (bundled_root() / "flights" / f"{config}.toml").is_file() or Path(config).is_file()
     path = find(config, "flights" if is_flight else "vehicles")
     data = read_toml(path)
+    if output is not None:
+        given = {**given, "output": {**data.get("output", {}), "kind": output}}
     if "vehicle" in data:
         flight = build_flight({**data, **given}, str(path))
     else:
@@ -128,7 +134,8 @@ def _print(document: dict[str, Any]) -> None:
     overcome = document["disturbance_overcome_m_s2"]
     say(f"disturbance held against with the estimator still: {overcome:.2f} m/s^2 (the limit must be below)")
     loop = document["sampled_loop"]
-    say(f"sampled loop at {1.0 / loop['interval_s']:.0f} Hz with {loop['delay_s'] * 1e3:.0f} ms of delay")
+    how = f"{1.0 / loop['interval_s']:.0f} Hz with {loop['delay_s'] * 1e3:.0f} ms of delay"
+    say(f"sampled loop at {how}, output {document['output']}")
     say(f"  {'largest |eigenvalue|':34s} {loop['spectral_radius']:.5f} (below 1)")
     say(f"  {'margin in delay':34s} {loop['delay_margin_s'] * 1e3:.1f} ms (at least 10 ms)")
     say(f"  {'longest tolerable interval':34s} {loop['interval_max_s'] * 1e3:.0f} ms")

@@ -70,7 +70,7 @@ def run(
     link.check()
     configured = _configured(vehicle, flight, controller_changes(controller, output))
     by_law = configured.output.controller == "law"
-    findings = [gains_finding(configured.vehicle)] if by_law else []
+    findings = [gains_finding(configured.vehicle, configured.output.by_law)] if by_law else []
     say(f"{configured.vehicle.name}: listening on {connect}; message rates are asked for there", quiet=as_json)
     record, compiled = FlightRecord(0, PHASE_NAMES), kernels("python")
     with link.open() as wire:

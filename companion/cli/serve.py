@@ -162,6 +162,6 @@ def _flight(vehicle: str, flight: str | None, changes: dict[str, Any]) -> dict[s
     else:
         built = load_flight(flight, adjustments(**changes, **vehicle_changes(vehicle), trajectory=hover))
     if built.output.controller == "law":
-        gate_gains(built.vehicle)
+        gate_gains(built.vehicle, built.output.by_law)
     own = {"name", "trajectory", "start", "world", "statistics_from_s"}  # of one flight, or of a simulated vehicle
     return built.model_dump(mode="json", exclude=own, exclude_none=True)

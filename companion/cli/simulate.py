@@ -63,7 +63,7 @@ def run(
         )
     path = of_flight(configured)
     say_notes(path.notes, quiet=as_json)
-    gate_gains(configured.vehicle, allow_uncertified=allow_uncertified)
+    gate_gains(configured.vehicle, configured.output.by_law, allow_uncertified=allow_uncertified)
     gate_reference(path, configured.vehicle)
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("simulating", total=1.0)

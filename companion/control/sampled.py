@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +61,8 @@ class Margins(NamedTuple):
     """Longest sample interval; at most INTERVAL_LIMIT_S is looked for."""
 
 
-def _jacobian(function: Callable[[FloatArray], FloatArray], at: FloatArray, scales: FloatArray) -> FloatArray:
+def jacobian(function: Callable[[FloatArray], FloatArray], at: FloatArray, scales: FloatArray) -> FloatArray:
+    """By central differences, a column per entry of `at`."""
     columns = []
     for i, h in enumerate(scales):
         offset = np.zeros_like(at)
@@ -70,12 +71,13 @@ def _jacobian(function: Callable[[FloatArray], FloatArray], at: FloatArray, scal
     return np.stack(columns, axis=1)
 
 
-def _state(x: FloatArray) -> State:
+def state_of(x: FloatArray) -> State:
+    """Position, velocity, rotation vector and body rates as a state."""
     n = x.tolist()
     return State((n[0], n[1], n[2]), (n[3], n[4], n[5]), quat_exp((n[6], n[7], n[8])), (n[9], n[10], n[11]))
 
 
-def _rotation(q: Quat) -> list[float]:
+def rotation_vector(q: Quat) -> list[float]:
     """The rotation vector of a small rotation, to third order."""
     return [2.0 * math.copysign(1.0, q[0]) * x for x in q[1:]]
 
@@ -84,7 +86,7 @@ def _rotation(q: Quat) -> list[float]:
 def _plant(
     vehicle: tuple[float, float, float], lags_s: tuple[float, float, float, float], duration_s: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """See `_Loop.plant`; kept, because it is most of the work and no gain is in it. The arrays cannot be written to."""
+    """See `Loop.plant`; kept, because it is most of the work and no gain is in it. The arrays cannot be written to."""
     if duration_s <= 0.0:
         found = np.eye(PLANT), np.zeros((PLANT, INPUTS)), np.zeros((PLANT, 3))
     else:
@@ -103,23 +105,23 @@ def _plant_over(
     weight = vehicle[0] * vehicle[1]
 
     def run(z: FloatArray) -> FloatArray:
-        state, thrust = _state(z), float(z[12])
+        state, thrust = state_of(z), float(z[12])
         n = z.tolist()
         for _ in range(pieces):
             state, thrust = advance(
                 state, thrust, (n[14], n[15], n[16]), n[13], (n[17], n[18], n[19]), vehicle, lags, piece_s
             )
-        return np.array([*state.p, *state.v, *_rotation(state.q), *state.w, thrust])
+        return np.array([*state.p, *state.v, *rotation_vector(state.q), *state.w, thrust])
 
     at = np.zeros(20)
     at[12] = at[13] = weight
     scales = np.full(20, 1e-5)
     scales[12] = scales[13] = 1e-4 * weight
-    j = _jacobian(run, at, scales)
+    j = jacobian(run, at, scales)
     return j[:, :13], j[:, 13:17], j[:, 17:20]
 
 
-class _Loop:
+class Loop:
     """The linearised pieces of one loop."""
 
     def __init__(self, parameters: Parameters, lags: tuple[float, float, float, float]) -> None:
@@ -147,14 +149,14 @@ class _Loop:
         def run(z: FloatArray) -> FloatArray:
             n = z.tolist()
             ctrl = ControllerState(n[12], n[13], (n[14], n[15], n[16]), self.memory, (0.0, 0.0, 0.0))
-            command, after, _ = step(_state(z), ref, ctrl, self.parameters, False, interval_s)
+            command, after, _ = step(state_of(z), ref, ctrl, self.parameters, False, interval_s)
             return np.array([command.thrust, *command.rates, after.thrust, after.thrust_rate, *after.b_hat])
 
         at = np.zeros(17)
         at[12] = self.weight
         scales = np.full(17, 1e-6)
         scales[12] = scales[13] = 1e-5 * self.weight
-        return _jacobian(run, at, scales)
+        return jacobian(run, at, scales)
 
 
 def loop_matrix(parameters: Parameters, timing: Timing, extra_delay_s: float = 0.0) -> FloatArray:
@@ -168,11 +170,11 @@ def loop_matrix(parameters: Parameters, timing: Timing, extra_delay_s: float = 0
         timing: interval, delay, lags.
         extra_delay_s: delay on top of `timing.delay_s` that the prediction knows nothing of [s].
     """
-    loop = _Loop(parameters, timing.lags_s)
+    loop = Loop(parameters, timing.lags_s)
     dt = timing.interval_s
     # how many intervals a command waits, and which part of an interval is left
-    waits, part = _split(timing.delay_s + extra_delay_s, dt)
-    waits_model, part_model = _split(timing.delay_s, dt)
+    waits, part = split(timing.delay_s + extra_delay_s, dt)
+    waits_model, part_model = split(timing.delay_s, dt)
     memory = max(waits, waits_model) + 1
     size = PLANT + 5 + 1 + INPUTS * memory
     control = loop.controller(dt)
@@ -222,7 +224,8 @@ def loop_matrix(parameters: Parameters, timing: Timing, extra_delay_s: float = 0
     return out
 
 
-def _split(delay_s: float, dt: float) -> tuple[int, float]:
+def split(delay_s: float, dt: float) -> tuple[int, float]:
+    """Whole intervals of a delay, and what is left of it [s]."""
     waits = int(delay_s / dt + 1e-9)
     return waits, max(0.0, delay_s - waits * dt)
 
@@ -254,12 +257,19 @@ def margins(
         delay_limit_s: no longer delay is looked at [s]; what is found up to there does not depend on it.
         interval_limit_s: no longer interval is looked at [s].
     """
-    radius = spectral_radius(parameters, timing)
+    return margins_of(partial(spectral_radius, parameters), timing, delay_limit_s, interval_limit_s)
+
+
+def margins_of(
+    radius_of: Callable[[Timing, float], float], timing: Timing, delay_limit_s: float, interval_limit_s: float
+) -> Margins:
+    """The same for any loop that gives its spectral radius for a timing and a delay on top of it [s]."""
+    radius = radius_of(timing, 0.0)
     if radius >= 1.0:
         return Margins(radius, 0.0, 0.0)
-    delay = _first_failure(lambda x: spectral_radius(parameters, timing, x) < 1.0, 0.0, delay_limit_s, DELAY_STRIDE_S)
+    delay = _first_failure(lambda x: radius_of(timing, x) < 1.0, 0.0, delay_limit_s, DELAY_STRIDE_S)
     interval = _first_failure(
-        lambda x: spectral_radius(parameters, timing._replace(interval_s=x)) < 1.0,
+        lambda x: radius_of(timing._replace(interval_s=x), 0.0) < 1.0,
         timing.interval_s,
         interval_limit_s,
         INTERVAL_STRIDE_S,

@@ -37,8 +37,8 @@ def coast_setpoint(flight: Flight, q: Quat, hover_share: float | None = None) ->
     thrust = thrust_fraction(thrust_n, vehicle.thrust_full_n, vehicle.rotors.curve_factor)
     if hover_share is not None:
         return RateSetpoint(min(hover_share / cosine, 1.0), (0.0, 0.0, 0.0))
-    if flight.output.kind == "attitude":
+    if flight.output.by_law == "attitude":
         return AttitudeSetpoint(thrust, q, 0.0)
-    if flight.output.kind == "actuators":
+    if flight.output.by_law == "actuators":
         return ActuatorSetpoint(thrust, (0.0, 0.0, 0.0))
     return RateSetpoint(thrust, (0.0, 0.0, 0.0))

@@ -69,4 +69,4 @@ def controller_of(
         return Calibrator(flight, Autopilot() if autopilot is None else autopilot, notify)
     if flight.output.controller == "px4":
         return Px4Baseline(flight.vehicle)
-    return Tracker(flight.vehicle, flight.output.kind, compiled)
+    return Tracker(flight.vehicle, flight.output.by_law, compiled)

@@ -21,6 +21,7 @@ class Gate(StrEnum):
     PARAMETERS = "parameters"
     VERSION = "version"
     OUTPUT = "output"
+    LOOP_HEALTH = "loop health"
     SETPOINTS = "setpoints"
     VEHICLE_TYPE = "vehicle type"
     LOSS_TIME = "offboard loss time"

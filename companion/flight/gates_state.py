@@ -6,11 +6,10 @@ from math import isfinite
 from typing import Final
 
 from companion.flight.findings import Finding, Gate, Measured, passed, refused, warning
+from companion.flight.loop_margins import DELAY_MARGIN_MIN_S
 from companion.flight.measure import CLOCK_ERROR_MAX_S, silence_limit_s
 from companion.flight.phases import LandedState
 
-DELAY_MARGIN_MIN_S: Final = 0.010
-"""By so much delay beyond the vehicle file's every certified loop stays stable."""
 RATE_FLOOR: Final = 0.8
 """Share of the vehicle file's state rate below which a flight is refused."""
 JITTER_WANTED_S: Final = 0.010
@@ -72,7 +71,7 @@ def state_age(m: Measured) -> Finding:
 def state_jitter(m: Measured) -> Finding:
     """States come evenly."""
     gate, jitter = Gate.STATE_JITTER, m.link.jitter_s
-    most = silence_limit_s(m.flight.vehicle.link.state_rate_hz)
+    most = _silence_s(m)
     limit = f"at most {most * 1e3:.0f} ms, {JITTER_WANTED_S * 1e3:.0f} ms wanted"
     if jitter is None:
         return _unmeasured(gate, limit)
@@ -89,7 +88,7 @@ def state_jitter(m: Measured) -> Finding:
 def state_gaps(m: Measured) -> Finding:
     """No gaps that would end a flight."""
     gate, link = Gate.STATE_GAPS, m.link
-    most = silence_limit_s(m.flight.vehicle.link.state_rate_hz)
+    most = _silence_s(m)
     limit = f"at most {GAPS_MAX} above {most * 1e3:.0f} ms, none above {LONG_GAP * most * 1e3:.0f} ms"
     if link.longest_gap_s is None:
         return _unmeasured(gate, limit)
@@ -202,6 +201,11 @@ def estimator_resets(m: Measured) -> Finding:
         sentence = "the estimate jumped while it was watched (its reset counter changed)"
         return refused(gate, shown, limit, sentence, "wait until the estimator has settled")
     return passed(gate, shown, limit, "the estimate did not jump while it was watched")
+
+
+def _silence_s(m: Measured) -> float:
+    """How long the flight waits for a state [s]."""
+    return silence_limit_s(m.flight.vehicle.link.state_rate_hz, calibrates=m.flight.calibration is not None)
 
 
 def _paced_s(m: Measured) -> float:

@@ -54,7 +54,7 @@ def gate(flight: Flight) -> None:
     by_law = flight.output.controller == "law"  # the gains, and what is predicted with them, are the law's
     gate_calibration(flight)
     if by_law:
-        gate_gains(flight.vehicle, brief=True)
+        gate_gains(flight.vehicle, flight.output.by_law, brief=True)
     gate_reference(trajectory, flight.vehicle)
     gate_place(trajectory, flight.height_min_m)
     if by_law:

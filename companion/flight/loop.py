@@ -22,6 +22,7 @@ from companion.control import flat
 from companion.control.output import Setpoint
 from companion.control.types import Quat, State, Vec3
 from companion.errors import LinkError
+from companion.flight.adaptation import Adaptation, adapted
 from companion.flight.calibration import Calibrator
 from companion.flight.clock import VehicleClock
 from companion.flight.coast import coast_setpoint
@@ -168,11 +169,13 @@ class FlightLoop:
         self._only_gates = only_gates
         self._paced = paced
         self._autopilot = Autopilot()
+        self._compiled = compiled
+        self._adaptation: Adaptation | None = None
         self._tracker = controller_of(flight, compiled, self._autopilot, notify)
         self._retuning = Retuning(self._tracker, notify) if isinstance(self._tracker, Tracker) else None
         self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
         self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
-        self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz)
+        self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz, calibrates=flight.calibration is not None)
         self._peer = PacedPeer()
         self._clock = VehicleClock(self._peer)
         self._clock.waits = True
@@ -317,8 +320,23 @@ class FlightLoop:
             *(self._flight, self._trajectory, self._ops, self._autopilot, self._engage, self._notify),
             only_gates=self._only_gates,
             waits=lambda: self._peer.paced,
+            adapt=self._adapt,
         )
         self._met = True
+
+    def _adapt(self, adaptation: Adaptation) -> None:
+        """The loop as it was measured asks for other setpoints or gains: all that flies is made anew, on the ground or
+        while the autopilot holds."""
+        self._adaptation = adaptation
+        self._flight = flight = adapted(self._flight, adaptation)
+        self._tracker = controller_of(flight, self._compiled, self._autopilot, self._notify)
+        self._retuning = Retuning(self._tracker, self._notify) if isinstance(self._tracker, Tracker) else None
+        offset = self._watch.offset
+        self._watch = Watch(flight, self._tracker, self._autopilot, self._notify)
+        self._watch.offset = offset
+        self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
+        self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
+        self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz)
 
     def _begin(self) -> bool:
         """Begins the flight once the vehicle's time is known, and whether it waits for us."""
@@ -546,7 +564,8 @@ class FlightLoop:
         assert course is not None
         begin_s = self._sequence.engaged_at_s
         self._watch.begin()
-        self._engagement = Engagement(begin_s, course.hold_point, course.yaw_rad, course.home, state.q, thrust_n)
+        where = course.hold_point, course.yaw_rad, course.home
+        self._engagement = Engagement(begin_s, *where, state.q, thrust_n, adaptation=self._adaptation)
         self._engaged(self._engagement)
 
     def _keep_ramps(self) -> None:

@@ -17,6 +17,9 @@ from companion.link.timesync import ClockOffset, clock_offset
 SILENCE_MIN_S: Final = 0.05
 """A state may be late by three of its periods, and by this at least: at 250 Hz three periods are 12 ms, which a busy
 machine takes for itself now and then; the prediction bridges that, and PX4 holds the last rates no longer than this."""
+CALIBRATION_SILENCE_S: Final = 0.15
+"""A calibration waits longer: its steps turn the vehicle by 0.12 rad meanwhile at the most, it is far from anything,
+and one that ends at every stall of a busy machine is never done."""
 SILENT_PERIODS: Final = 3.0
 USUAL: Final = 0.9
 """Jitter is what this share of the states keeps within: one stall of the machine is not the link's."""
@@ -25,9 +28,9 @@ CLOCK_ERROR_MAX_S: Final = 0.05
 _REQUESTS_MAX = 100
 
 
-def silence_limit_s(state_rate_hz: float) -> float:
+def silence_limit_s(state_rate_hz: float, *, calibrates: bool = False) -> float:
     """How long a flight waits for the next state before it ends for want of them [s]."""
-    return max(SILENT_PERIODS / state_rate_hz, SILENCE_MIN_S)
+    return max(SILENT_PERIODS / state_rate_hz, CALIBRATION_SILENCE_S if calibrates else SILENCE_MIN_S)
 
 
 class LinkFigures(NamedTuple):

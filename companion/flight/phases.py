@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from companion.control.types import Quat, Vec3
 from companion.errors import ExitCode
+from companion.flight.adaptation import Adaptation
 from companion.flight.health import EstimatorHealth, SystemHealth
 from companion.flight.resets import Reset
 from companion.flight.retuning import Transition
@@ -168,6 +169,9 @@ class Engagement:
     delays: tuple[tuple[float, float], ...] = ()
     """What the prediction's delay became [s], each with the stamp of the first state that it was used for [s]."""
 
+    adaptation: Adaptation | None = None
+    """What was flown instead of what the files say; None: as they say."""
+
     @classmethod
     def from_numbers(cls, entry: Mapping[str, Any]) -> Engagement:
         """Reads what `dataclasses.asdict` gave, as JSON keeps it. Raises KeyError, TypeError or ValueError."""
@@ -183,7 +187,15 @@ class Engagement:
             tuple(Transition.from_numbers(way) for way in entry.get("transitions", ())),
             tuple(Reset.from_numbers(reset) for reset in entry.get("resets", ())),
             tuple((float(at_s), float(delay_s)) for at_s, delay_s in entry.get("delays", ())),
+            _adaptation(entry.get("adaptation")),
         )
+
+
+def _adaptation(entry: Any) -> Adaptation | None:
+    if entry is None:
+        return None
+    output, share, rate_hz, age_s = entry
+    return Adaptation(str(output), float(share), float(rate_hz), float(age_s))
 
 
 def _vector(numbers: Sequence[float]) -> Vec3:

@@ -13,16 +13,18 @@ from datetime import UTC, datetime
 
 from companion.config import Flight, Vehicle
 from companion.control.certificate import certify, disturbance_overcome
-from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S, Margins, Timing, margins
+from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S, Margins
 from companion.errors import RefusedError
-from companion.flight import gates_state
+from companion.flight.adaptation import Adaptation, adapted
 from companion.flight.findings import Finding, Gate, Measured, Verdict, passed, refusal, refused
 from companion.flight.gates import DOWN, judge
 from companion.flight.gates_setup import NEEDED, calibrated
 from companion.flight.health import ESTIMATOR_STATUS, SYS_STATUS
 from companion.flight.inspection import reference_problems
+from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, loop_margins
 from companion.flight.measure import LinkMeter, silence_limit_s
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState
+from companion.flight.schedule import choose
 from companion.flight.silence import Silence, when_silent
 from companion.flight.surroundings import Problem, place_problems
 from companion.link import codec
@@ -30,7 +32,6 @@ from companion.link.operations import Operation, Operations, Retry
 from companion.link.telemetry import VehicleState
 from companion.trajectory.anchored import Trajectory, anchored
 
-DELAY_MARGIN_MIN_S = gates_state.DELAY_MARGIN_MIN_S
 MEASURE_S = 1.0
 ASK_FASTER = 0.8
 """Asking for exactly the source's period loses messages: ask for a shorter interval."""
@@ -83,22 +84,14 @@ HOLD_THRUST_HZ = 20.0
 RUN_PREARM_CHECKS = 401
 
 
-def timing(vehicle: Vehicle) -> Timing:
-    """The sampled loop of a vehicle file."""
-    x, y, z = vehicle.autopilot.rate_lag_s
-    return Timing(
-        1.0 / vehicle.link.state_rate_hz,
-        vehicle.delay_s,
-        (x, y, z, vehicle.rotors.lag_s),
-        vehicle.controller.prediction,
-    )
-
-
-def gate_gains(vehicle: Vehicle, *, allow_uncertified: bool = False, brief: bool = False) -> Margins:
+def gate_gains(
+    vehicle: Vehicle, output: str = "rates", *, allow_uncertified: bool = False, brief: bool = False
+) -> Margins:
     """The certificate and the delay margin; every flight passes here.
 
     Args:
         vehicle: the vehicle file.
+        output: what the law sends.
         allow_uncertified: refuse nothing.
         brief: look at the margins no further than what is asked of them: the same verdict in a fraction of the time.
 
@@ -107,7 +100,8 @@ def gate_gains(vehicle: Vehicle, *, allow_uncertified: bool = False, brief: bool
     """
     parameters = vehicle.parameters()
     failure = certify(parameters.gains, parameters.model.drag).failure()
-    hint = "change [controller], see `companion certify`"
+    over = " over attitude setpoints" if output == "attitude" else ""
+    hint = "use output rates, or lower gains" if over else "change [controller], see `companion certify`"
     if failure and not allow_uncertified:
         raise RefusedError(f"the gains of vehicle {vehicle.name!r} are not certified: {failure}; {hint}")
     overcome = disturbance_overcome(parameters.gains)
@@ -120,17 +114,18 @@ def gate_gains(vehicle: Vehicle, *, allow_uncertified: bool = False, brief: bool
         )
     gap = vehicle.limits.state_gap_max_s
     if brief:
-        found = margins(parameters, timing(vehicle), DELAY_MARGIN_MIN_S + DELAY_STRIDE_S, gap + 1.5 * INTERVAL_STRIDE_S)
+        found = loop_margins(vehicle, output, DELAY_MARGIN_MIN_S + DELAY_STRIDE_S, gap + 1.5 * INTERVAL_STRIDE_S)
     else:
-        found = margins(parameters, timing(vehicle))
+        found = loop_margins(vehicle, output)
     if gap > found.interval_max_s > 0.0 and not allow_uncertified:
         raise RefusedError(
             f"vehicle {vehicle.name!r}: limits.state_gap_max_s {gap * 1e3:g} ms is longer than the"
-            f" {found.interval_max_s * 1e3:.0f} ms that the sampled loop bears; lower it"
+            f" {found.interval_max_s * 1e3:.0f} ms that the sampled loop{over} bears; lower it"
+            + (f", or {hint}" if over else "")
         )
     if found.delay_margin_s < DELAY_MARGIN_MIN_S and not allow_uncertified:
         raise RefusedError(
-            f"the gains of vehicle {vehicle.name!r} leave a delay margin of {found.delay_margin_s * 1e3:.1f} ms,"
+            f"the gains of vehicle {vehicle.name!r}{over} leave a delay margin of {found.delay_margin_s * 1e3:.1f} ms,"
             f" {DELAY_MARGIN_MIN_S * 1e3:g} ms are required; {hint}"
         )
     return found
@@ -147,11 +142,11 @@ def gate_calibration(flight: Flight) -> None:
         raise RefusedError(finding.told)
 
 
-def gains_finding(vehicle: Vehicle) -> Finding:
+def gains_finding(vehicle: Vehicle, output: str = "rates") -> Finding:
     """`gate_gains` as a line of the table of gates."""
     limit = f"certified, {DELAY_MARGIN_MIN_S * 1e3:g} ms of delay margin"
     try:
-        found = gate_gains(vehicle)
+        found = gate_gains(vehicle, output)
     except RefusedError as error:
         return refused(Gate.GAINS, "refused", limit, str(error), "")
     shown = f"{found.delay_margin_s * 1e3:.1f} ms"
@@ -196,16 +191,24 @@ class Preflight:
         operations: requests to the autopilot.
         autopilot: what it says of itself; gets the parameters that are read.
         notify: called with lines for people: warnings, and what happens when this program falls silent.
+        adapt: called when all gates let it pass and the measured loop asks for other setpoints or gains.
     """
 
     def __init__(
-        self, flight: Flight, operations: Operations, autopilot: Autopilot, notify: Callable[[str], None]
+        self,
+        flight: Flight,
+        operations: Operations,
+        autopilot: Autopilot,
+        notify: Callable[[str], None],
+        adapt: Callable[[Adaptation], None] = lambda adaptation: None,
     ) -> None:
+        self._adapt = adapt
         self._flight = flight
         self._ops = operations
         self._autopilot = autopilot
         self._notify = notify
-        self.meter = LinkMeter(silence_limit_s(flight.vehicle.link.state_rate_hz))
+        calibrates = flight.calibration is not None
+        self.meter = LinkMeter(silence_limit_s(flight.vehicle.link.state_rate_hz, calibrates=calibrates))
         """Measures the link; the loop tells it what comes."""
         self.findings: list[Finding] = []
         """Of all gates, once they have judged."""
@@ -321,18 +324,23 @@ class Preflight:
                 self._autopilot.parameters[name] = float(operation.value)
         assert self._rate is not None
         words = () if self._words is None else self._ops.texts.complaints(self._words.asked_s, now_s)
+        figures = self.meter.figures(now_s)
+        choice = choose(self._flight, figures)
+        flown = adapted(self._flight, choice.adaptation)
         measured = Measured(
-            *(self._flight, self._autopilot, self._ops.version, self.meter.figures(now_s), self._unread()),
+            *(flown, self._autopilot, self._ops.version, figures, self._unread()),
             rate_refusal="" if self._rate.accepted else self._rate.sentence,
             complaints=tuple(words),
         )
-        self.findings = judge(measured)
+        self.findings = [choice.finding, *judge(measured)]
         for finding in self.findings:
             if finding.verdict is Verdict.WARNING:
                 self._notify(f"warning: {finding.told}")
         against = refusal(self.findings)
         if against:
             raise FlightEnded(Cause.REFUSED, against)
+        if choice.adaptation is not None:
+            self._adapt(choice.adaptation)
         self._notify(self.silence.sentence)
 
     @property

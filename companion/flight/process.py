@@ -109,7 +109,7 @@ class Ready:
         trajectory = of_flight(flight)
         compiled = kernels(engine)
         if flight.output.controller == "law":
-            gate_gains(flight.vehicle, brief=True)
+            gate_gains(flight.vehicle, flight.output.by_law, brief=True)
             line(f"engine: {compiled.engine}")
         elif flight.output.controller == "px4":
             line("controller: PX4's own, it gets the reference as setpoints")

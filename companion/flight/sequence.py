@@ -15,6 +15,7 @@ from functools import partial
 from companion.config import Flight
 from companion.control.types import Vec3
 from companion.errors import RefusedError
+from companion.flight.adaptation import Adaptation
 from companion.flight.course import Course
 from companion.flight.orders import Orders
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Order, Phase
@@ -84,6 +85,7 @@ class Sequence:
         notify: called with a line for people.
         only_gates: the gates judge, and nothing is asked of the vehicle after that.
         waits: whether the vehicle's time stands still while we compute (lockstep).
+        adapt: called before anything moves when the measured loop asks for other setpoints or gains.
     """
 
     def __init__(
@@ -97,6 +99,7 @@ class Sequence:
         *,
         only_gates: bool = False,
         waits: Callable[[], bool] = lambda: True,
+        adapt: Callable[[Adaptation], None] = lambda adaptation: None,
     ) -> None:
         self.phase = Phase.CONNECT
         self.changes: list[PhaseChange] = []
@@ -111,7 +114,7 @@ class Sequence:
         self._autopilot = autopilot
         self._engage = engage
         self._notify = notify
-        self.preflight = Preflight(flight, operations, autopilot, notify)
+        self.preflight = Preflight(flight, operations, autopilot, notify, adapt)
         self._only_gates = only_gates
         self._waits = waits
         self._planning: Planning | None = None

@@ -55,6 +55,10 @@ class Seen(NamedTuple):
     """In lockstep: nothing is judged by the wall clock."""
 
 
+BEHIND_NS = 5_000_000
+"""Two clocks whose offset is followed are nearer to each other."""
+
+
 class _Count(NamedTuple):
     at_s: float
     steps: int
@@ -101,8 +105,14 @@ class Watch:
         return True
 
     def age_s(self, t_vehicle_us: int, arrival_ns: int) -> float | None:
-        """How old a state was when it arrived [s]; None while the autopilot's clock is not known."""
-        offset_ns = self.offset.offset_ns(arrival_ns)
+        """How old a state was when it arrived [s]; None while the autopilot's clock is not known.
+
+        By the offset of the last second where the one that is followed has fallen behind: the clock of a simulated
+        autopilot stalls with its machine, by a second in some minutes, and its states would seem older and older.
+        """
+        offset_ns, recent_ns = self.offset.offset_ns(arrival_ns), self.offset.recent_ns
+        if offset_ns is not None and recent_ns is not None and abs(offset_ns - recent_ns) > BEHIND_NS:
+            offset_ns = recent_ns
         return None if offset_ns is None else (arrival_ns + offset_ns - 1000 * t_vehicle_us) * 1e-9
 
     def delay_figures(self) -> dict[str, float | None]:

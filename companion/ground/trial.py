@@ -10,7 +10,8 @@ from typing import Final, Protocol
 
 from companion.control.sampled import spectral_radius
 from companion.errors import CompanionError
-from companion.flight.preflight import DELAY_MARGIN_MIN_S, gate_gains, timing
+from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, timing
+from companion.flight.preflight import gate_gains
 from companion.flight.retuning import flown, points, unsound
 from companion.ground.tuning import Tuning
 

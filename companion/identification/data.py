@@ -79,7 +79,9 @@ def flight_data(source: FlightSource) -> FlightData:
     age_s = 1e-3 * record.column("state_age_ms")[rows]
     known = bool(np.all(np.isfinite(age_s)) and np.median(age_s) >= 0.0 and np.max(np.abs(age_s)) < AGE_MAX_S)
     sent_s = np.maximum.accumulate(t_s + age_s) if known else t_s
-    sends_rates = source.configuration.get("output", {}).get("kind", "rates") == "rates"
+    adaptation = (source.summary.get("engagement") or {}).get("adaptation")
+    kind = source.configuration.get("output", {}).get("kind", "auto") if adaptation is None else adaptation[0]
+    sends_rates = kind in {"auto", "rates"}
     rates = record.columns("rate_cmd_x", "rate_cmd_y", "rate_cmd_z")[rows]
     if not sends_rates:
         rates = np.full_like(rates, np.nan)

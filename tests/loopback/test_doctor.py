@@ -124,7 +124,7 @@ def test_link_that_is_wrong_in_many_ways(tmp_path) -> None:
     faults = (
         fault("delay", delay_s=0.03, direction="from_vehicle", messages=MESSAGES),
         fault("jitter", jitter_s=0.03, direction="from_vehicle", messages=MESSAGES),
-        fault("loss", share=0.2, direction="from_vehicle", messages=MESSAGES),
+        fault("loss", share=0.65, direction="from_vehicle", messages=MESSAGES),
         *(fault("silence", t, t + 0.1, messages=MESSAGES) for t in (0.6, 0.8, 1.0)),
         fault("delay", delay_s=0.05, direction="to_vehicle", messages=["TIMESYNC"]),
         fault("timesync", offset_s=0.3),
@@ -145,6 +145,20 @@ def test_link_that_is_wrong_in_many_ways(tmp_path) -> None:
             Gate.CLOCK: ("refused", "look for a second program"),
         },
     )
+
+
+def test_a_loop_that_is_worse_than_the_vehicle_file_says(tmp_path) -> None:
+    """Half of the states: they are enough with what is certified for them."""
+    count = [0]
+
+    def thinned(stand: Stand, msg_id: int, raw: bytes) -> list[bytes]:
+        count[0] += msg_id == codec.ID_ODOMETRY
+        return [] if msg_id == codec.ID_ODOMETRY and count[0] % 2 else [raw]
+
+    with Stand(make_flight(), tmp_path, alter=thinned) as stand:
+        found = look(stand)
+    assert found.outcome.cause is Cause.INSPECTED
+    says(found, {Gate.LOOP_HEALTH: ("warning", "(states at 50 Hz, not 100): output rates, 100% of its gains")})
 
 
 def test_bunched_states_count(tmp_path) -> None:

@@ -96,7 +96,7 @@ REFUSALS = {
         "set COM_OBL_RC_ACT to 5",
     ),
     "actuators on 1.18": (dict(), dict(output__kind="actuators"), "since 1.14; use output rates"),
-    "few states": (dict(), {}, "ODOMETRY comes at 50 Hz, 80 Hz are required"),
+    "few states": (dict(), {}, "ODOMETRY comes at 33 Hz, 80 Hz are required"),
     "no parameters": (dict(), {}, "reading COM_OBL_RC_ACT got no answer"),
 }
 
@@ -104,11 +104,11 @@ REFUSALS = {
 @pytest.mark.parametrize("what", REFUSALS)
 def test_refused_before_anything_moves(what: str, tmp_path) -> None:
     options, changes, says = REFUSALS[what]
-    every_second = [0]
+    every_third = [0]
 
     def thinned(stand, msg_id, raw):
-        every_second[0] += msg_id == codec.ID_ODOMETRY
-        return [] if msg_id == codec.ID_ODOMETRY and every_second[0] % 2 else [raw]
+        every_third[0] += msg_id == codec.ID_ODOMETRY
+        return [] if msg_id == codec.ID_ODOMETRY and every_third[0] % 3 else [raw]
 
     def mute(stand, msg_id, raw):
         return [] if msg_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE else [raw]

@@ -87,7 +87,10 @@ def test_what_the_command_line_does_not_know(refusal: Refusal, arguments: list[s
         (["simulate", "eight", "--engine", "gpu"], "engine 'gpu': must be one of auto, python, numba"),
         (["simulate", "eight", "--time-scale", "0"], "time_scale = 0.0"),
         (["simulate", "eight", "--time-scale", "nan"], "time_scale = nan"),
-        (["demo", "--output", "torque"], "output.kind = 'torque': input should be 'rates', 'attitude' or 'actuators'"),
+        (
+            ["demo", "--output", "torque"],
+            "output.kind = 'torque': input should be 'auto', 'rates', 'attitude' or 'actuators'",
+        ),
         (["demo", "--state-age", "-0.1"], "state_age_s = -0.1"),
         (["demo", "--wind", "-12,0"], "--wind '-12,0': expected three numbers north,east,down in m/s"),
         (["demo", "--wind", "nan,0,0"], "world.wind_m_s.0 = nan"),
