@@ -3,11 +3,11 @@
     python tools/starved.py                 the table of docs/tracking.md: both vehicles, about five minutes
     python tools/starved.py --vehicle bundled --speeds 1 --seeds 2 --json
 
-The very controller that flies and its guards against the bundled physics, on vehicle time (`campaign.starved`): the same
-on any machine. Steps 30 % late, 40 to 60 of them a second instead of 100, and gaps of 100 to 400 ms every five seconds
-on average; COM_OF_LOSS_T is 1 s, so that only gaps above 0.5 s would end a flight. Errors are of the figure of eight
-from 12 s on, as if nobody watched; "handed over" counts the flights that the guards would have ended, and how far off
-the worst was then.
+The very controller that flies and its guards against the bundled physics, on vehicle time (`campaign.starved`): the
+same on any machine. Steps 30 % late, 40 to 60 of them a second instead of 100, and gaps of 100 to 400 ms every five
+seconds on average; COM_OF_LOSS_T is 1 s, so that only gaps above 0.5 s would end a flight. Errors are of the figure of
+eight from 12 s on, as if nobody watched; "handed over" counts the flights that the guards would have ended, and how far
+off the worst was then.
 """
 
 from __future__ import annotations

@@ -15,16 +15,13 @@ from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.control import heading
 from companion.control.heading import HeadingState
 from companion.control.law import ControllerState, Parameters, step
+from companion.control.linearise import FloatArray, jacobian, rotation_vector, split, state_of
 from companion.control.model import advance, factors
-from companion.control.types import Quat, Reference, State
-from companion.control.vectors import quat_exp
-
-FloatArray = NDArray[np.float64]
+from companion.control.types import Reference
 
 PLANT = 13
 """p, v, rotation vector, w, thrust."""
@@ -59,27 +56,6 @@ class Margins(NamedTuple):
     """Delay that the prediction does not know of, up to which the loop is stable; sought up to MARGIN_LIMIT_S."""
     interval_max_s: float
     """Longest sample interval; at most INTERVAL_LIMIT_S is looked for."""
-
-
-def jacobian(function: Callable[[FloatArray], FloatArray], at: FloatArray, scales: FloatArray) -> FloatArray:
-    """By central differences, a column per entry of `at`."""
-    columns = []
-    for i, h in enumerate(scales):
-        offset = np.zeros_like(at)
-        offset[i] = h
-        columns.append((function(at + offset) - function(at - offset)) / (2.0 * h))
-    return np.stack(columns, axis=1)
-
-
-def state_of(x: FloatArray) -> State:
-    """Position, velocity, rotation vector and body rates as a state."""
-    n = x.tolist()
-    return State((n[0], n[1], n[2]), (n[3], n[4], n[5]), quat_exp((n[6], n[7], n[8])), (n[9], n[10], n[11]))
-
-
-def rotation_vector(q: Quat) -> list[float]:
-    """The rotation vector of a small rotation, to third order."""
-    return [2.0 * math.copysign(1.0, q[0]) * x for x in q[1:]]
 
 
 @lru_cache(maxsize=256)
@@ -222,12 +198,6 @@ def loop_matrix(parameters: Parameters, timing: Timing, extra_delay_s: float = 0
         keep = [i for i in range(size) if not PLANT + 2 <= i < PLANT + 5]
         out = out[np.ix_(keep, keep)]
     return out
-
-
-def split(delay_s: float, dt: float) -> tuple[int, float]:
-    """Whole intervals of a delay, and what is left of it [s]."""
-    waits = int(delay_s / dt + 1e-9)
-    return waits, max(0.0, delay_s - waits * dt)
 
 
 def _apply(rows: FloatArray, g: FloatArray, i: int, command: Callable[[int], slice], law: FloatArray) -> None:

@@ -15,20 +15,16 @@ import numpy as np
 from scipy.linalg import expm
 
 from companion.control.law import ControllerState, Parameters, step
+from companion.control.linearise import FloatArray, jacobian, rotation_vector, split, state_of
 from companion.control.output import Conversion, attitude_output
 from companion.control.sampled import (
     INTERVAL_LIMIT_S,
     MARGIN_LIMIT_S,
     PLANT,
-    FloatArray,
     Loop,
     Margins,
     Timing,
-    jacobian,
     margins_of,
-    rotation_vector,
-    split,
-    state_of,
 )
 from companion.control.types import Reference, Vec3
 

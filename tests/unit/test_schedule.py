@@ -71,7 +71,8 @@ def test_the_attitude_loop_becomes_unstable_where_its_margins_end() -> None:
 
 def test_a_stiff_attitude_loop_is_as_good_as_body_rates_at_low_gains() -> None:
     """At low gains the slowest pole is the law's, whatever takes its commands."""
-    vehicle = slower(load_vehicle("bundled", {"link": {"state_rate_hz": 100.0}}), 0.3)
+    heading = {"heading_l1_1_s": 8.0, "heading_l2_1_s": 8.0}
+    vehicle = slower(load_vehicle("bundled", {"link": {"state_rate_hz": 100.0}, "controller": heading}), 0.3)
     inner = AttitudeLoop((12.0, 12.0, 12.0), 0.0)
     whole = np.abs(np.linalg.eigvals(loop_matrix(vehicle.parameters(), timing(vehicle), inner))).max()
     assert whole == pytest.approx(spectral_radius(vehicle.parameters(), timing(vehicle)), abs=1e-5)
