@@ -1,4 +1,4 @@
-"""The traffic log of a flight in the hands of others: MAVProxy takes every message of it in, pymavlink's tools open it."""
+"""The traffic log of a flight in the hands of others: MAVProxy takes every message in, pymavlink's tools open it."""
 
 from __future__ import annotations
 
