@@ -1,6 +1,7 @@
 """The ladder of responses to a guard that is broken: slower, to rest, Hold, Land, silence.
 
-The last rungs are the sequence's: it hands over to Hold, to Land where Hold is refused, and then sends nothing more.
+The last rungs are the sequence's: it hands over to Hold, to Return or Land where Hold is refused, and then sends
+nothing more.
 """
 
 from __future__ import annotations

@@ -48,8 +48,8 @@ START_SPEED_MAX_M_S = 1.0
 DRIFT_MAX_M = 0.5
 """Moved further while its course was planned, the vehicle would begin with a step."""
 START_TIMEOUT_S = 30.0
-HANDOVER_MODES = (modes.HOLD, modes.LAND)
-"""What the autopilot is asked for at the end, the next one where it refuses the one before."""
+RETURN_ON_LOSS = 3.0
+"""COM_OBL_RC_ACT: what the autopilot does when setpoints cease."""
 REFUSALS_MAX = 3
 """One refusal may be of the moment: PX4 judges a mode ten times per second."""
 INTENTION_WAIT_S = 0.3
@@ -129,7 +129,7 @@ class Sequence:
         self._mode_at_end: Mode | None = None
         self._mode_at_landing: Mode | None = None
         self._confirmed_hold_s: float | None = None
-        self._rungs: tuple[Mode, ...] = HANDOVER_MODES
+        self._rungs: tuple[Mode, ...] = self.ladder
         self._refusals = 0
         self._rest_for: tuple[Cause, str] | None = None
         """Why a guard lets the course come to rest."""
@@ -150,6 +150,15 @@ class Sequence:
     def owes_hold(self) -> bool:
         """Whether the vehicle may be following our setpoints, or was asked for Hold and has not acknowledged it."""
         return self.duty is not Duty.NOTHING or (self.ending is not None and self._confirmed_hold_s is None)
+
+    @property
+    def ladder(self) -> tuple[Mode, ...]:
+        """What the autopilot is asked for at the end, the next one where it refuses the one before.
+
+        Return only if that is what its owner wants of it when setpoints cease: it climbs, and flies away.
+        """
+        returns = self._autopilot.parameters.get("COM_OBL_RC_ACT") == RETURN_ON_LOSS
+        return (modes.HOLD, modes.RETURN, modes.LAND) if returns else (modes.HOLD, modes.LAND)
 
     # -- events ---------------------------------------------------------------------------------------------------
 
@@ -212,19 +221,19 @@ class Sequence:
         else:
             self.end(cause, detail, now_s)
 
-    def end(self, cause: Cause, detail: str, now_s: float, rungs: tuple[Mode, ...] = HANDOVER_MODES) -> None:
+    def end(self, cause: Cause, detail: str, now_s: float, rungs: tuple[Mode, ...] = ()) -> None:
         """Begins to hand over to the autopilot; the first cause stays.
 
         Args:
             cause: why.
             detail: figures, for people.
             now_s: vehicle time [s].
-            rungs: the modes to ask for, the next one where the autopilot refuses the one before.
+            rungs: the modes to ask for, the next one where the autopilot refuses the one before; () for `ladder`.
         """
         if self.ending is not None:
             return
         self.ending = (cause, detail)
-        self._rungs, self._refusals = rungs, 0
+        self._rungs, self._refusals = rungs or self.ladder, 0
         self._operation = None
         self._step_s = now_s - HANDOVER_INTERVAL_S
         self._since_s = now_s

@@ -68,6 +68,7 @@ def test_a_key_in_a_real_px4(instance: int, folder: Path, tmp_path: Path) -> Non
         assert answers(connection, key, BOOT_S)
         link = Link(instance)
         try:
+            link.passed(1.0)  # an answer to what was asked with the key may still be under way
             with pytest.raises(AssertionError, match="no answer"):
                 link.command(512, VERSION)
         finally:

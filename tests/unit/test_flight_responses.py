@@ -119,24 +119,50 @@ def test_land_at_once() -> None:
     assert (ended.cause, ended.detail) == (Cause.BATTERY, "figures; the vehicle is in Land")
 
 
-def test_where_hold_is_refused_land_is_asked_for_and_then_nothing() -> None:
+@pytest.mark.parametrize(
+    ("action", "rungs"), [(5.0, ["Hold", "Land"]), (3.0, ["Hold", "Return", "Land"])], ids=["hold", "return"]
+)
+def test_where_hold_is_refused_the_next_rung_is_asked_for_and_then_nothing(action: float, rungs: list[str]) -> None:
+    """Return is a rung where the autopilot's owner wants it when setpoints cease (COM_OBL_RC_ACT 3)."""
     script = on_course()
+    script.autopilot.parameters["COM_OBL_RC_ACT"] = action
     script.ops.at_once = False
     begun_s, before = script.now_s, len(script.ops.asked)
     find(script, Guard.ESTIMATOR, Response.HOLD)
-    for _ in range(200):
+    for _ in range(300):
         script.run(0.02)
         for operation in script.ops.asked:
             operation.end(Result.TEMPORARILY_REJECTED, script.now_s)
-        if script.sequence.duty is Duty.NOTHING or script.now_s - begun_s > 1.0:
+        if script.sequence.duty is Duty.NOTHING or script.now_s - begun_s > 1.5:
             break
     asked = script.ops.since(before)
-    assert asked[:3] == ["changing to Hold"] * 3
-    assert set(asked[3:]) == {"changing to Land"}
-    assert any("changing to Hold was rejected for now; asking for Land" in line for line in script.lines)
+    for index, rung in enumerate(rungs[:-1]):
+        assert asked[3 * index : 3 * index + 3] == [f"changing to {rung}"] * 3
+        said = f"changing to {rung} was rejected for now; asking for {rungs[index + 1]}"
+        assert any(said in line for line in script.lines)
+    assert set(asked[3 * len(rungs) - 3 :]) == {"changing to Land"}
     ended = script.ends()
     assert ended.cause is Cause.ESTIMATOR
     assert ended.detail.endswith("Land was not acknowledged, the autopilot's own failsafe acts")
+    assert script.sequence.duty is Duty.NOTHING
+
+
+def test_return_that_is_taken_ends_the_flight() -> None:
+    script = on_course()
+    script.autopilot.parameters["COM_OBL_RC_ACT"] = 3.0
+    script.ops.at_once = False
+    find(script, Guard.ESTIMATOR, Response.HOLD)
+    for _ in range(200):
+        script.run(0.02)
+        returns = [operation for operation in script.ops.asked if operation.what == "changing to Return"]
+        if returns:
+            returns[0].end(Result.ACCEPTED, script.now_s)
+            break
+        for operation in script.ops.asked:
+            operation.end(Result.TEMPORARILY_REJECTED, script.now_s)
+    script.be(modes.RETURN)
+    ended = script.ends()
+    assert (ended.cause, ended.detail) == (Cause.ESTIMATOR, "figures; the vehicle is in Return")
     assert script.sequence.duty is Duty.NOTHING
 
 
