@@ -123,12 +123,12 @@ def test_fly_refuses_a_vehicle_that_was_never_calibrated(tmp_path, capfd) -> Non
 
 
 @pytest.mark.long
-def test_a_calibration_over_sockets_gives_a_file_that_flies(tmp_path, capsys) -> None:
+def test_a_calibration_over_sockets_gives_a_file_that_flies(tmp_path, capfd) -> None:
     """The whole way: fly, fit, write, and fly the figure of eight with nothing but the file."""
     out, file = tmp_path / "calibration", tmp_path / "found.toml"
     arguments = ["--mass", "1.1", "--repeats", "2", "--out", str(out), "--save", str(file), "--json"]
     assert main(["calibrate", "--sim", *arguments]) == ExitCode.DONE
-    document = json.loads(capsys.readouterr().out)
+    document = json.loads(capfd.readouterr().out)
     assert document["warnings"] == []
     assert document["thrust"]["hover_share"] == pytest.approx(0.4905, rel=0.01)
     assert document["calibration"]["hover_thrust_hold"] == pytest.approx(0.4905, rel=0.02)
@@ -137,5 +137,5 @@ def test_a_calibration_over_sockets_gives_a_file_that_flies(tmp_path, capsys) ->
     for name, vehicle in (("truth", "bundled"), ("found", str(file))):
         command = ["simulate", "eight", "--vehicle", vehicle, "--json"]
         assert main(command) == ExitCode.DONE
-        summary[name] = json.loads(capsys.readouterr().out)
+        summary[name] = json.loads(capfd.readouterr().out)
     assert summary["found"]["position_rms_m"] < 1.2 * summary["truth"]["position_rms_m"]

@@ -9,13 +9,13 @@ from typing import Any
 from companion.campaign.simulate import loop_setpoint, simulated_vehicle, simulated_world
 from companion.config import CalibrationFlight, Flight, build_flight, find, read_toml
 from companion.control.output import RateSetpoint
-from companion.control.types import State
+from companion.control.types import Quat, State
+from companion.control.vectors import quat_exp
 from companion.flight.calibration import Calibrator
 from companion.flight.course import at_rest
 from companion.flight.manoeuvres import length_s, plan
 from companion.flight.phases import PHASE_NAMES, Autopilot, Phase
 from companion.flight.rows import StepTiming, control_row
-from companion.frames import quat_from_yaw
 from companion.link.telemetry import VehicleState
 from companion.record.flight_record import FlightRecord
 from companion.record.flight_source import FlightSource
@@ -60,7 +60,7 @@ def fly(
         air.set_gains(make_gains(sim, "1.18")._replace(curve_factor=undone_curve))
     told: list[str] = []
     calibrator = Calibrator(flight, Autopilot(hold_thrust=hover_share), told.append)
-    calibrator.begin(State(HOVER_M, (0.0, 0.0, 0.0), quat_from_yaw(0.0), (0.0, 0.0, 0.0)))
+    calibrator.begin(State(HOVER_M, (0.0, 0.0, 0.0), leaning(flight), (0.0, 0.0, 0.0)))
     steps = round(sim.loop_rate_hz / vehicle.link.state_rate_hz)
     assert flight.calibration is not None
     count = int(length_s(plan(flight.calibration)) * vehicle.link.state_rate_hz)
@@ -84,6 +84,12 @@ def fly(
         air.advance(acting, fresh, steps)
     configuration = flight.model_dump(exclude_none=True)
     return FlightSource(Path("flown"), record, {}, configuration, "flown"), calibrator, told
+
+
+def leaning(flight: Flight) -> Quat:
+    """The attitude in which the autopilot's own Hold had the vehicle: it leans against a steady wind."""
+    north, east, _ = (flight.vehicle.body.drag_1_s * speed / 9.81 for speed in flight.world.wind_m_s)
+    return quat_exp((-east, north, 0.0))
 
 
 def hover_share(flight: Flight, curve: float = 0.0) -> float:
