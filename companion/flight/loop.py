@@ -15,20 +15,19 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 from companion.config import Flight
-from companion.control import flat
 from companion.control.output import Setpoint
-from companion.control.types import Quat, State, Vec3
+from companion.control.types import State
 from companion.errors import LinkError
+from companion.flight.accounting import Accounting, FlownStep, Progress
 from companion.flight.adaptation import Adaptation, adapted
 from companion.flight.calibration import Calibrator
 from companion.flight.clock import VehicleClock
 from companion.flight.coast import coast_setpoint
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
 from companion.flight.controller import controller_of
-from companion.flight.course import Course, at_rest
+from companion.flight.course import at_rest
 from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
 from companion.flight.measure import silence_limit_s
@@ -38,10 +37,9 @@ from companion.flight.preflight import Preflight
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report, vehicle_facts
 from companion.flight.responses import respond
 from companion.flight.retuning import ParameterChange, Retuning
-from companion.flight.rows import StepTiming, control_row
 from companion.flight.sequence import Duty, Sequence
-from companion.flight.tracker import Kernels, Tracker, TrackerStep
-from companion.flight.watch import Seen, Watch
+from companion.flight.tracker import Kernels, Tracker
+from companion.flight.watch import Watch
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
@@ -71,51 +69,8 @@ lockstep they cost a third of the time."""
 LOCKSTEP_SPIN_S = 0.0005
 """A vehicle in lockstep answers within this: sleeping would cost more than the wait. Elsewhere the loop sleeps."""
 HEARTBEAT_INTERVAL_S = 1.0
-LATE_SHARE = 0.2
 IDLE_WAIT_S = 0.1
 BUSY_WAIT_S = 0.01
-PROGRESS_NS = 100_000_000
-
-
-class Progress(NamedTuple):
-    """What a display may show of a running flight."""
-
-    phase: str
-    t_s: float
-    """Time on the trajectory [s], negative before."""
-    duration_s: float
-    error_m: float
-    steps: int
-    to_go_s: float
-    """Of the whole course, at its own pace."""
-    lyapunov: float
-    disturbance_m_s2: Vec3
-    """As estimated, NED; NaN, as the one before, where the law does not fly."""
-    position_m: Vec3
-    """As received, NED."""
-    attitude: Quat
-    """As received."""
-    reference_m: Vec3
-    """NED."""
-    thrust_n: float
-    """NaN where the law does not fly."""
-    state_age_ms: float
-    battery: float | None
-    """Share that is left; None: unknown."""
-
-
-class _Step(NamedTuple):
-    """A control step whose setpoint is out, before it is recorded and judged."""
-
-    state: VehicleState
-    out: TrackerStep
-    course: Course
-    course_s: float
-    """Time since engaging [s]."""
-    phase: Phase
-    track_s: float
-    skipped: int
-    arrival_ns: int
 
 
 class FlightLoop:
@@ -173,8 +128,6 @@ class FlightLoop:
         self._adaptation: Adaptation | None = None
         self._tracker = controller_of(flight, compiled, self._autopilot, notify)
         self._retuning = Retuning(self._tracker, notify) if isinstance(self._tracker, Tracker) else None
-        self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
-        self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
         self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz, calibrates=flight.calibration is not None)
         self._peer = PacedPeer()
         self._clock = VehicleClock(self._peer)
@@ -193,14 +146,13 @@ class FlightLoop:
         self._sent_us: int | None = None
         """Stamp of the last state that a setpoint went out for."""
         self._coasted = False
-        self._unaccounted: _Step | None = None
+        self._unaccounted: FlownStep | None = None
         self._engagement: Engagement | None = None
         self._sent_ns = 0
         self._watch = Watch(flight, self._tracker, self._autopilot, notify)
+        self._accounting = self._accounts(flight)
         self._heartbeat_s = -math.inf
-        self._progress_ns = 0
         self._requests: list[tuple[Timesync, Frame]] = []
-        self._timesync_at_ns: int | None = None
         self._begun_ns = self._heard_ns = self._spoken_ns = time.monotonic_ns()
         self._known_ns: int | None = None
 
@@ -334,9 +286,12 @@ class FlightLoop:
         offset = self._watch.offset
         self._watch = Watch(flight, self._tracker, self._autopilot, self._notify)
         self._watch.offset = offset
-        self._interval_s = 1.0 / flight.vehicle.link.state_rate_hz
-        self._late_ns = int(LATE_SHARE * self._interval_s * 1e9)
+        asked_ns, self._accounting = self._accounting.asked_ns, self._accounts(flight)
+        self._accounting.asked_ns = asked_ns
         self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz)
+
+    def _accounts(self, flight: Flight) -> Accounting:
+        return Accounting(flight, self._record, self._watch, self._autopilot, self._peer, self._clock, self._progress)
 
     def _begin(self) -> bool:
         """Begins the flight once the vehicle's time is known, and whether it waits for us."""
@@ -452,7 +407,7 @@ class FlightLoop:
         self._clock.on_timesync(message.ts1, frame.arrival_wall_ns)
         self._requests.append((message, frame))
         if self._peer.paced:
-            self._timesync_at_ns = message.ts1
+            self._accounting.asked_ns = message.ts1
             self._sequence.preflight.meter.on_paced_request(message.ts1)
             self._wire.gather()
             try:
@@ -592,7 +547,9 @@ class FlightLoop:
             return
         self._sent_ns = time.monotonic_ns()
         track_s = sequence.track_time_s(stamp_s)
-        self._unaccounted = _Step(state, out, course, stamp_s - begin_s, sequence.phase, track_s, skipped, arrival_ns)
+        self._unaccounted = FlownStep(
+            state, out, course, stamp_s - begin_s, sequence.phase, track_s, skipped, arrival_ns
+        )
 
     def _account(self) -> None:
         """Records and judges the last step: after its setpoint is out, and while a vehicle in lockstep moves on."""
@@ -600,59 +557,13 @@ class FlightLoop:
         step, self._unaccounted = self._unaccounted, None
         if step is None:
             return
-        state, sent_ns = step.state, self._sent_ns
-        reference = step.course.at(step.course_s)
-        error = (state.p[0] - reference.p[0], state.p[1] - reference.p[1], state.p[2] - reference.p[2])
-        shown_s = step.track_s if step.phase is Phase.TRACK else math.nan
-        timing = self._timing(state, step.skipped, step.arrival_ns, sent_ns)
-        row = control_row(shown_s, step.phase, state, reference, error, step.out, timing)
-        self._record.append(row)
         if self._retuning is not None:
             self._retuning.tick()
-        age_s, paced = self._age_of(state, step), self._peer.paced
-        seen = Seen(state, error, step.out, step.skipped, timing.late, age_s, step.arrival_ns, paced)
-        finding = self._watch.on_step(seen, step.course, self._last_state_s)
+        finding = self._accounting.settle(step, self._sent_ns, self._last_state_s)
         if finding is not None:
             respond(self._sequence, finding, self._last_state_s)
-        if sent_ns - self._progress_ns > PROGRESS_NS:
-            self._progress_ns = sent_ns
-            self._progress(self._standing(step, reference.p, math.hypot(*error), timing.age_ms))
+        if self._accounting.show(step, self._sent_ns):
             self._keep_ramps()
-
-    def _standing(self, step: _Step, reference_m: Vec3, error_m: float, age_ms: float) -> Progress:
-        course, n, state = step.course, step.out.numbers, step.state
-        to_go_s = max(0.0, course.duration_s - course.course_s(step.course_s))
-        north, east, down = n[flat.B_HAT]
-        return Progress(
-            phase=step.phase.value,
-            t_s=step.track_s,
-            duration_s=course.track_s,
-            error_m=error_m,
-            steps=len(self._record),
-            to_go_s=to_go_s,
-            lyapunov=n[flat.LYAPUNOV],
-            disturbance_m_s2=(north, east, down),
-            position_m=state.p,
-            attitude=state.q,
-            reference_m=reference_m,
-            thrust_n=n[flat.TOTAL],
-            state_age_ms=age_ms,
-            battery=self._autopilot.battery,
-        )
-
-    def _age_of(self, state: VehicleState, step: _Step) -> float | None:
-        """How old the state was at its arrival [s]."""
-        if self._timesync_at_ns is not None:
-            return (self._timesync_at_ns - state.t_vehicle_us * 1000) * 1e-9
-        return self._watch.age_s(state.t_vehicle_us, step.arrival_ns)
-
-    def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:
-        took_ns = sent_ns - arrival_ns
-        if self._timesync_at_ns is not None:
-            age_ms = (self._timesync_at_ns - state.t_vehicle_us * 1000 + took_ns) * 1e-6
-        else:
-            age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
-        return StepTiming(age_ms, took_ns * 1e-3, took_ns > self._late_ns, skipped)
 
     def _send(self, setpoint: Setpoint, state: VehicleState) -> bool:
         try:

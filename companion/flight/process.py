@@ -20,9 +20,10 @@ from typing import Any
 
 from companion.config import Flight, build_flight, read_toml
 from companion.errors import CompanionError, ExitCode
+from companion.flight.accounting import Progress
 from companion.flight.controller import controller_of
 from companion.flight.host import Host
-from companion.flight.loop import FlightLoop, Progress
+from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.preflight import BASELINE_PARAMETERS, gate_gains
 from companion.flight.tracker import Kernels, kernels

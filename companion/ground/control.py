@@ -21,8 +21,9 @@ from typing import Any, Final
 
 from companion.config import build_flight
 from companion.errors import CompanionError, ExitCode, InputError, LinkError
+from companion.flight.accounting import Progress
 from companion.flight.connect import AUTOPILOT_COMPONENT
-from companion.flight.loop import FlightLoop, Progress
+from companion.flight.loop import FlightLoop
 from companion.flight.phases import Cause, Order, Phase
 from companion.flight.process import Status, ask_the_system, warm_up
 from companion.flight.retuning import ParameterChange

@@ -17,7 +17,7 @@ from companion.cli.live import LiveDisplay
 from companion.cli.rerun_stream import RerunStream, attitude_enu
 from companion.control.vectors import rotate_to_inertial
 from companion.errors import InputError
-from companion.flight.loop import Progress
+from companion.flight.accounting import Progress
 from companion.frames import enu_from_ned, quat_from_yaw
 
 

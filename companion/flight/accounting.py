@@ -1,0 +1,165 @@
+"""What is done about a control step once its setpoint is out: its row in the record, its judgement, what people see.
+
+Nothing here delays a command: the loop comes here while the vehicle is already acting on the answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from companion.config import Flight
+from companion.control import flat
+from companion.control.types import Quat, Vec3
+from companion.flight.clock import VehicleClock
+from companion.flight.course import Course
+from companion.flight.guards import Finding
+from companion.flight.phases import Autopilot, Phase
+from companion.flight.rows import StepTiming, control_row
+from companion.flight.tracker import TrackerStep
+from companion.flight.watch import Seen, Watch
+from companion.link.telemetry import VehicleState
+from companion.link.timesync import PacedPeer
+from companion.record.flight_record import FlightRecord
+
+LATE_SHARE = 0.2
+"""Of the states' interval: a setpoint that takes longer is late."""
+PROGRESS_NS = 100_000_000
+
+
+class Progress(NamedTuple):
+    """What a display may show of a running flight."""
+
+    phase: str
+    t_s: float
+    """Time on the trajectory [s], negative before."""
+    duration_s: float
+    error_m: float
+    steps: int
+    to_go_s: float
+    """Of the whole course, at its own pace."""
+    lyapunov: float
+    disturbance_m_s2: Vec3
+    """As estimated, NED; NaN, as the one before, where the law does not fly."""
+    position_m: Vec3
+    """As received, NED."""
+    attitude: Quat
+    """As received."""
+    reference_m: Vec3
+    """NED."""
+    thrust_n: float
+    """NaN where the law does not fly."""
+    state_age_ms: float
+    battery: float | None
+    """Share that is left; None: unknown."""
+
+
+class FlownStep(NamedTuple):
+    """A control step whose setpoint is out."""
+
+    state: VehicleState
+    out: TrackerStep
+    course: Course
+    course_s: float
+    """Time since engaging [s]."""
+    phase: Phase
+    track_s: float
+    skipped: int
+    """States that were not answered before this one."""
+    arrival_ns: int
+
+
+class Accounting:
+    """Keeps the accounts of one flight.
+
+    Args:
+        flight: the configuration.
+        record: gets one row per step.
+        watch: judges the steps.
+        autopilot: what it says of itself.
+        peer: whether the vehicle waits for us.
+        clock: the vehicle's.
+        progress: called at most ten times per second of wall time; must not block.
+    """
+
+    def __init__(
+        self,
+        flight: Flight,
+        record: FlightRecord,
+        watch: Watch,
+        autopilot: Autopilot,
+        peer: PacedPeer,
+        clock: VehicleClock,
+        progress: Callable[[Progress], None],
+    ) -> None:
+        self._record, self._watch, self._autopilot = record, watch, autopilot
+        self._peer, self._clock = peer, clock
+        self._progress = progress
+        self._late_ns = int(LATE_SHARE / flight.vehicle.link.state_rate_hz * 1e9)
+        self._shown_ns = 0
+        self.asked_ns: int | None = None
+        """The vehicle's time when it last asked for our answer in lockstep [ns]; None elsewhere."""
+
+    def settle(self, step: FlownStep, sent_ns: int, state_s: float) -> Finding | None:
+        """Records and judges a step; what is to be done about it.
+
+        Args:
+            step: that was flown.
+            sent_ns: when its setpoint went out, `time.monotonic_ns()`.
+            state_s: vehicle time at the arrival of its state [s].
+        """
+        state = step.state
+        reference = step.course.at(step.course_s)
+        p, d = state.p, reference.p
+        error = (p[0] - d[0], p[1] - d[1], p[2] - d[2])
+        shown_s = step.track_s if step.phase is Phase.TRACK else math.nan
+        timing = self._timing(state, step.skipped, step.arrival_ns, sent_ns)
+        self._record.append(control_row(shown_s, step.phase, state, reference, error, step.out, timing))
+        seen = Seen(
+            state, error, step.out, step.skipped, timing.late, self._age_s(step), step.arrival_ns, self._peer.paced
+        )
+        return self._watch.on_step(seen, step.course, state_s)
+
+    def show(self, step: FlownStep, sent_ns: int) -> bool:
+        """Shows people how the flight stands, when it is time for that. Returns whether it was."""
+        if sent_ns - self._shown_ns <= PROGRESS_NS:
+            return False
+        self._shown_ns = sent_ns
+        self._progress(self._standing(step, self._timing(step.state, 0, step.arrival_ns, sent_ns).age_ms))
+        return True
+
+    def _standing(self, step: FlownStep, age_ms: float) -> Progress:
+        course, n, state = step.course, step.out.numbers, step.state
+        reference_m = course.at(step.course_s).p
+        north, east, down = n[flat.B_HAT]
+        return Progress(
+            phase=step.phase.value,
+            t_s=step.track_s,
+            duration_s=course.track_s,
+            error_m=math.dist(state.p, reference_m),
+            steps=len(self._record),
+            to_go_s=max(0.0, course.duration_s - course.course_s(step.course_s)),
+            lyapunov=n[flat.LYAPUNOV],
+            disturbance_m_s2=(north, east, down),
+            position_m=state.p,
+            attitude=state.q,
+            reference_m=reference_m,
+            thrust_n=n[flat.TOTAL],
+            state_age_ms=age_ms,
+            battery=self._autopilot.battery,
+        )
+
+    def _age_s(self, step: FlownStep) -> float | None:
+        """How old the state was at its arrival [s]."""
+        if self.asked_ns is not None:
+            return (self.asked_ns - step.state.t_vehicle_us * 1000) * 1e-9
+        return self._watch.age_s(step.state.t_vehicle_us, step.arrival_ns)
+
+    def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:
+        took_ns = sent_ns - arrival_ns
+        if self.asked_ns is not None:
+            age_ms = (self.asked_ns - state.t_vehicle_us * 1000 + took_ns) * 1e-6
+        else:
+            age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
+        return StepTiming(age_ms, took_ns * 1e-3, took_ns > self._late_ns, skipped)
