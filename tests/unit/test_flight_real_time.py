@@ -287,7 +287,7 @@ def test_states_that_cease_during_the_checks(flight: Flight, wire: VirtualWire) 
     wire.alter = lambda msg_id, raw: [] if wire.vehicle.t_us > 2_000_000 and msg_id == ODOMETRY else [raw]
     outcome, _ = fly(flight, wire)
     assert outcome.cause is Cause.REFUSED
-    assert "ODOMETRY comes at" in outcome.sentence
+    assert "the longest time without a state was" in outcome.sentence
     assert wire.setpoints(-math.inf) == []
 
 
