@@ -13,6 +13,9 @@ from companion.record.flight_data import FlightData
 _SPACE_POINTS: Final = 1500
 """A line in space is drawn point by point: so many are smooth enough, and light enough for a phone."""
 
+_THICKNESS: Final = 0.12
+"""Share of the longest side that every side of the scene in space has at least: there must be room for its ticks."""
+
 
 def _reference(flight: FlightData) -> Array:
     """North and east of the reference, shape (len, 2); NaN outside of the track phase."""
@@ -85,12 +88,27 @@ def path_in_space(flight: FlightData) -> dict[str, Any]:
     layout["legend"] = {"orientation": "h", "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom"}
     axes = {f"{letter}axis": {"title": {"text": text}, "gridcolor": "#dfe4ea", "zeroline": False}
             for letter, text in (("x", "East [m]"), ("y", "North [m]"), ("z", "Up [m]"))}  # fmt: skip
-    layout["scene"] = {
-        **axes,
-        "aspectmode": "data",
-        "camera": {"eye": {"x": 1.3, "y": -1.7, "z": 1.0}, "center": {"x": 0.0, "y": 0.0, "z": -0.2}},
-    }
+    layout["scene"] = {**axes, "camera": {"eye": {"x": 0.75, "y": -0.98, "z": 0.62}, "center": {"z": -0.1}}}
+    _fill(layout["scene"], np.concatenate((path, reference)) * (1.0, 1.0, -1.0))
     return {"data": data, "layout": layout}
+
+
+def _fill(scene: dict[str, Any], points: Array) -> None:
+    """Let a scene span north, east and up of these, true to scale, its longest side as long as the camera sees whole.
+
+    Plotly's own true scale makes a flat path so large that its ends are cut off on a phone.
+    """
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return
+    low, high = points.min(axis=0), points.max(axis=0)
+    longest = max(float(np.max(high - low)), 0.5)
+    spans = 1.08 * np.maximum(high - low, _THICKNESS * longest)
+    for letter, middle, span in zip("yxz", ((low + high) / 2.0).tolist(), spans.tolist(), strict=True):
+        scene[f"{letter}axis"]["range"] = [middle - span / 2.0, middle + span / 2.0]
+        scene[f"{letter}axis"]["nticks"] = 3 if span < 0.25 * longest else 7
+        scene.setdefault("aspectratio", {})[letter] = span / longest
+    scene["aspectmode"] = "manual"
 
 
 def _space_line(points: Array, name: str, colour: str, width: float) -> dict[str, Any]:

@@ -126,6 +126,11 @@ function draw(figure) {
   // On a touch screen a finger on a figure scrolls the page.
   figure.layout.dragmode = touch ? false : "zoom";
   const element = document.getElementById(figure.key);
+  const eye = figure.layout.scene?.camera?.eye;
+  if (eye) {  // the scene fills the height of its figure; where there is less width it is seen from further away
+    const away = Math.min(1.9, Math.max(1.0, 1.25 * element.clientHeight / element.clientWidth));
+    for (const axis of "xyz") { eye[axis] *= away; }
+  }
   Plotly.newPlot(element, figure.data, figure.layout, config);
   if (linked.includes(figure.key)) {
     element.on("plotly_relayout", change => follow(figure.key, change));

@@ -222,7 +222,7 @@ def _tiles(summary: Mapping[str, Any]) -> str:
         ("95 % of the time below", _length(summary.get("position_p95_m")), window),
         ("Largest", _length(summary.get("position_max_m")), window),
         ("Vertical error, rms", _length(summary.get("vertical_rms_m")), window),
-        ("Settled after", _with(summary.get("settled_at_s"), "s"), "below 0.2 m from then on"),
+        ("Settled after", _settled(summary.get("settled_at_s")), "below 0.2 m from then on"),
         ("Heading error, rms", "free" if heading is None else _with(math.degrees(heading), "°"), window),
         ("Sideways speed, rms", _length(summary.get("body_sideways_rms_m_s"), "/s"), window),
         (
@@ -310,6 +310,11 @@ def _with(value: object, unit: str) -> str:
     if not isinstance(value, int | float):
         return "–"
     return f"{_number(value, 3)}{'' if unit == '°' else ' '}{unit}"
+
+
+def _settled(value: object) -> str:
+    """A time at which the flight was within its bound from the start is nought, not some microseconds."""
+    return f"{value:.2f} s" if isinstance(value, int | float) else "–"
 
 
 def _length(value: object, per: str = "") -> str:

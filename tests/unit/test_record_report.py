@@ -217,7 +217,14 @@ def test_time_figures_and_no_others_are_zoomed_together(page):
 
 def test_the_path_in_space_is_true_to_scale_with_up_upwards(page, record):
     figure = page.figures["path"]
-    assert figure["layout"]["scene"]["aspectmode"] == "data"
+    scene = figure["layout"]["scene"]
+    assert scene["aspectmode"] == "manual"
+    for letter, name in (("x", "p_e"), ("y", "p_n"), ("z", "p_d")):
+        low, high = scene[f"{letter}axis"]["range"]
+        sign = -1.0 if letter == "z" else 1.0
+        assert low < (sign * record.column(name)).min() <= (sign * record.column(name)).max() < high
+        scale = (high - low) / scene["aspectratio"][letter]
+        assert scale == pytest.approx(scene["xaxis"]["range"][1] - scene["xaxis"]["range"][0], rel=1.0)
     flown = next(trace for trace in figure["data"] if trace["name"] == "flown")
     up = np.frombuffer(base64.b64decode(flown["z"]["bdata"]), dtype="<f4")
     assert up.max() == pytest.approx(-record.column("p_d").min(), abs=0.05)
