@@ -59,7 +59,10 @@ def run(
     seed: Annotated[int | None, typer.Option("--seed", help="Of noise and gusts.")] = None,
     faults: FaultsOption = None,
     key: VehicleKeyOption = None,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Fly at real time instead of in lockstep.")] = False,
+    wall_clock: Annotated[
+        bool, typer.Option("--wall-clock", help="Fly at the pace of the wall clock instead of as fast as possible.")
+    ] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", hidden=True)] = False,  # what --wall-clock was called
     out: OutOption = None,
     engine: EngineOption = "auto",
     realtime: RealtimeOption = False,
@@ -102,7 +105,7 @@ def run(
             folder,
             px4=version,
             engine=engine,
-            lockstep=not real_time,
+            lockstep=not (wall_clock or real_time),
             faults=faults_path,
             timeout_s=CONNECT_TIMEOUT_S,
             quiet=as_json,
