@@ -369,6 +369,8 @@ class Flight(Section):
     acceptance: Acceptance = Acceptance()
     statistics_from_s: NotNegative | None = None
     takeoff_altitude_m: Positive = 5.0
+    takeoff: Literal["autopilot", "offboard"] = "autopilot"
+    """Who takes off: the autopilot's own take-off, which needs a global position, or position setpoints in Offboard."""
     height_min_m: Finite = 0.5
     """Lowest height above home that a trajectory may ask for; below zero where the ground falls off."""
     after: Literal["hold", "land"] = "hold"

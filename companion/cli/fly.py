@@ -67,6 +67,10 @@ def run(
     ] = None,
     output: Annotated[str | None, typer.Option("--output", help='"rates", "attitude" or "actuators".')] = None,
     controller: ControllerOption = None,
+    takeoff: Annotated[
+        str | None,
+        typer.Option("--takeoff", help='By the "autopilot" (default), or in "offboard", without a global position.'),
+    ] = None,
     land: Annotated[bool, typer.Option("--land", help="Land at the end instead of holding.")] = False,
     time_scale: TimeScaleOption = None,
     laps: LapsOption = None,
@@ -108,6 +112,7 @@ def run(
     changes: dict[str, Any] = {
         **trajectory_changes(trajectory, frame),
         "after": "land" if land else None,
+        "takeoff": takeoff,
         "vehicle__simulated": True if sim or simulator else None,
         **controller_changes(controller, output),
     }

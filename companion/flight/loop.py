@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from companion.config import Flight
-from companion.control.output import Setpoint
+from companion.control.output import PositionSetpoint, Setpoint
 from companion.control.types import State
 from companion.errors import LinkError
 from companion.flight.accounting import Accounting, FlownStep, Progress
@@ -66,6 +66,8 @@ NOT_NEEDED = (24, 30, 31, 32, 33, 36, 65, 74, 85, 105, 141)
 """Streams that a flight does not use: GPS_RAW_INT, ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED,
 GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, RC_CHANNELS, VFR_HUD, POSITION_TARGET_LOCAL_NED, HIGHRES_IMU, ALTITUDE. In
 lockstep they cost a third of the time."""
+ATTITUDE_INTERVAL_US = 3_200
+"""Of ATTITUDE_QUATERNION, which refreshes the rotation that is predicted: PX4 has one at each of its 4 ms."""
 LOCKSTEP_SPIN_S = 0.0005
 """A vehicle in lockstep answers within this: sleeping would cost more than the wait. Elsewhere the loop sleeps."""
 HEARTBEAT_INTERVAL_S = 1.0
@@ -224,9 +226,12 @@ class FlightLoop:
         )
 
     def _scale_fact(self) -> dict[str, float]:
-        """What the thrust was found to be, over what the vehicle file says, where that is followed."""
-        scale = self._tracker.thrust_scale if isinstance(self._tracker, Tracker) else None
-        return {} if scale is None else {"thrust_scale": scale}
+        """What the thrust was found to be, over what the vehicle file says, where that is followed; and how many states
+        an attitude newer than they refreshed."""
+        if not isinstance(self._tracker, Tracker):
+            return {}
+        scale = self._tracker.thrust_scale
+        return {"refreshed_states": float(self._tracker.refreshed)} | ({} if scale is None else {"thrust_scale": scale})
 
     def _fly(self) -> tuple[Cause, str]:
         try:
@@ -315,6 +320,8 @@ class FlightLoop:
             self._paced()
             for msgid in NOT_NEEDED:
                 self._ops.set_message_interval(msgid, STOP_MESSAGE, now_s)
+        elif isinstance(self._tracker, Tracker):  # in lockstep each state is answered before anything newer comes
+            self._ops.set_message_interval(codec.ATTITUDE_QUATERNION, ATTITUDE_INTERVAL_US, now_s)
         return True
 
     # -- one turn -------------------------------------------------------------------------------------------------
@@ -473,8 +480,14 @@ class FlightLoop:
         self._last_state_s, self._last_arrival_ns = now_s, arrival_ns
         sequence.on_state(state, now_s)
         if sequence.duty is Duty.NOTHING:
+            if sequence.phase is Phase.JOIN:  # it holds after a climb of ours: what was sent before has ended
+                self._sent_us = None
             return
         if before is not None and before.reset_counter != state.reset_counter and not self._carry(state, now_s):
+            return
+        if sequence.duty is Duty.CLIMB and not self._silent_too_long(state):
+            assert sequence.climb is not None
+            self._send(sequence.climb.setpoint(state.t_vehicle_us * 1e-6), state)
             return
         if self._silent_too_long(state):
             assert self._sent_us is not None
@@ -489,8 +502,8 @@ class FlightLoop:
 
     def _carry(self, state: VehicleState, now_s: float) -> bool:
         """The autopilot's estimate was reset: the reference moves along. False: by too much, the flight ends."""
-        assert self._sequence.course is not None
-        problem = self._watch.on_reset(state, self._sequence.course)
+        course = self._sequence.course
+        problem = "during the take-off" if course is None else self._watch.on_reset(state, course)
         if problem:
             detail = f"{problem}, reset counter {state.reset_counter}"
             self._stop_answering(Cause.ESTIMATE_JUMPED, detail, now_s)
@@ -581,6 +594,9 @@ class FlightLoop:
         if self._coasted or state is None or self._sequence.duty is Duty.NOTHING:
             return
         self._coasted = True
+        if self._sequence.duty is Duty.CLIMB:
+            self._send(PositionSetpoint(None, (0.0, 0.0, 0.0), None, None, None), state)
+            return
         hover = self._tracker.hover_share if isinstance(self._tracker, Calibrator) else None
         self._send(coast_setpoint(self._flight, state.q, hover), state)
 

@@ -16,6 +16,7 @@ from companion.config import Flight
 from companion.control.types import Vec3
 from companion.errors import RefusedError
 from companion.flight.adaptation import Adaptation
+from companion.flight.climb import Climb
 from companion.flight.course import Course
 from companion.flight.orders import Orders
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Order, Phase
@@ -71,6 +72,7 @@ class Duty(Enum):
     NOTHING = "no setpoint is due"
     STREAM = "hold setpoints, so that OFFBOARD can be entered"
     TRACK = "setpoints that follow the course"
+    CLIMB = "position setpoints that take off"
 
 
 class Sequence:
@@ -105,6 +107,8 @@ class Sequence:
         self.changes: list[PhaseChange] = []
         self.duty = Duty.NOTHING
         self.course: Course | None = None
+        self.climb: Climb | None = None
+        """Of a take-off in Offboard."""
         self.engaged_at_s = 0.0
         """Vehicle time (of state stamps) at which the course begins."""
         self.ending: tuple[Cause, str] | None = None
@@ -124,6 +128,8 @@ class Sequence:
         self._step_s = 0.0
         self._operation: Operation | None = None
         self._asked = False
+        self._leaving = False
+        """Whether Hold was asked for at the top of a climb in Offboard."""
         self._settled_since_s: float | None = None
         self._mode_seen = False
         self._mode_at_end: Mode | None = None
@@ -178,6 +184,10 @@ class Sequence:
         self._state, self._state_s = state, now_s
         if self.ending is None and self.duty is Duty.TRACK:
             self._follow_course(state.t_vehicle_us * 1e-6)
+        elif self.climb is not None and self.duty is Duty.CLIMB and self.ending is None:
+            astray = self.climb.astray(state)
+            if astray:
+                self.end(Cause.POSITION_ERROR, astray, now_s)
 
     def tick(self, now_s: float) -> None:
         """Lets time pass: called at every turn of the loop.
@@ -239,7 +249,9 @@ class Sequence:
         self._since_s = now_s
         self._mode_at_end = self._autopilot.mode
         self._notify(f"ending: {cause.value.sentence}" + (f": {detail}" if detail else ""))
-        if self.duty is not Duty.TRACK:
+        if self.climb is not None:
+            self.climb.stop(self.stamp_s)
+        if self.duty not in {Duty.TRACK, Duty.CLIMB}:
             self.duty = Duty.NOTHING
 
     def interrupt(self, now_s: float) -> None:
@@ -270,6 +282,9 @@ class Sequence:
 
     def _take_off(self, now_s: float) -> None:
         """NAV_TAKEOFF, then arming, then waiting until the autopilot holds up there."""
+        if self._flight.takeoff == "offboard":
+            self._climb_in_offboard(now_s)
+            return
         state = self._state
         if self._operation is None:
             self._operation = self._ops.takeoff(self.preflight.takeoff_amsl_m(state), now_s)
@@ -297,6 +312,44 @@ class Sequence:
         elif now_s - self._settled_since_s >= SETTLED_FOR_S:
             self.enter(Phase.JOIN, now_s, "the vehicle holds at its take-off height")
             self._hold_first(now_s)
+
+    def _climb_in_offboard(self, now_s: float) -> None:
+        """Setpoints for where it stands, Offboard, arming; then the point rises, and at the top Hold is asked for."""
+        state, autopilot = self._state, self._autopilot
+        if now_s - self._since_s > TAKEOFF_TIMEOUT_S:
+            self.end(Cause.REFUSED, f"no steady hold was reached within {TAKEOFF_TIMEOUT_S:g} s of take-off", now_s)
+        elif self.climb is None:
+            if state is not None and now_s - self._state_s < FRESH_S:
+                self.climb = Climb(state, self._flight.takeoff_altitude_m)
+                self.duty, self._step_s = Duty.CLIMB, now_s
+        elif now_s - self._step_s < STREAM_BEFORE_OFFBOARD_S or state is None:
+            return
+        elif self._operation is None:
+            self._operation = self._ops.set_mode(modes.OFFBOARD, now_s, Retry(0.5, 8))
+        elif self._operation.pending or self._refused(self._operation, now_s):
+            return
+        elif not self._asked:
+            self._asked = True
+            self._operation = self._ops.arm(now_s)
+            self._since_s = now_s
+        elif not self._leaving:
+            self._rise(self.climb, state, now_s)
+        elif autopilot.mode == modes.HOLD:
+            self.duty, self.climb = Duty.NOTHING, None
+            self.enter(Phase.JOIN, now_s, "the vehicle holds at its take-off height, climbed to in Offboard")
+            self._hold_first(now_s)
+
+    def _rise(self, climb: Climb, state: VehicleState, now_s: float) -> None:
+        """Armed: the point rises once Offboard is reported; at the top Hold is asked for."""
+        autopilot = self._autopilot
+        if not autopilot.armed:
+            if now_s - self._since_s > CONFIRM_TIMEOUT_S + 1.0:
+                self.end(Cause.REFUSED, "the autopilot disarmed before it took off", now_s)
+        elif autopilot.mode == modes.OFFBOARD:
+            climb.begin(self.stamp_s)
+            if climb.arrived(state) and self._slower_than(SETTLED_SPEED_M_S, now_s):
+                self._leaving = True
+                self._operation = self._ops.set_mode(modes.HOLD, now_s)
 
     def _refused(self, operation: Operation, now_s: float) -> bool:
         """Whether the autopilot refused what was asked; ends the flight with its reason, which may come a little
@@ -474,7 +527,8 @@ class Sequence:
             if self.duty is Duty.TRACK and not self._autopilot.armed:
                 self.duty = Duty.NOTHING
                 raise FlightEnded(Cause.DISARMED, "nothing more is sent")
-            self._mode_seen = self._mode_seen or mode == _AWAITED.get(self.phase)
+            awaited = modes.OFFBOARD if self.duty is Duty.CLIMB else _AWAITED.get(self.phase)
+            self._mode_seen = self._mode_seen or mode == awaited
             allowed = self._allowed_modes()
             if allowed is None or mode in allowed:
                 return
@@ -490,6 +544,9 @@ class Sequence:
 
     def _allowed_modes(self) -> set[Mode] | None:
         """The modes that this flight's own requests lead to now; None for any."""
+        if self.duty is Duty.CLIMB:
+            rises = self._asked and self._mode_seen and self._autopilot.armed
+            return {modes.OFFBOARD, modes.HOLD} if rises and self._leaving else {modes.OFFBOARD} if rises else None
         if self.phase is Phase.TAKEOFF:
             return {modes.TAKEOFF, modes.HOLD} if self._mode_seen and self._autopilot.armed else None
         if self.phase is Phase.LAND:
