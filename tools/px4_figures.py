@@ -14,14 +14,17 @@ PX4 does not wait for the companion.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
 import time
 from datetime import UTC, datetime
 from pathlib import Path
+from random import Random
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -163,7 +166,43 @@ def calibrate(session: Session, vehicle: str, mass_kg: float, out: Path) -> Path
     return found
 
 
-def fly(session: Session, row: Row, words: list[str], folder: Path) -> dict[str, Any]:
+class Stalls:
+    """Stops the control process of a flight for a while, again and again, as a starved machine does.
+
+    Args:
+        seconds: shortest and longest stall, and the mean time from one to the next.
+        seed: of all three.
+    """
+
+    def __init__(self, seconds: list[float], seed: int = 1) -> None:
+        self._shortest, self._longest, self._every = seconds
+        self._random = Random(seed)
+        self._next_s = math.nan
+
+    def turn(self, flight: int, now_s: float) -> None:
+        """Called often while the flight is in OFFBOARD; stalls when it is due.
+
+        Args:
+            flight: process id of `companion fly`.
+            now_s: any clock.
+        """
+        if math.isnan(self._next_s):
+            self._next_s = now_s + self._random.expovariate(1.0 / self._every)
+        if now_s < self._next_s:
+            return
+        children = Path(f"/proc/{flight}/task/{flight}/children").read_text().split()
+        stopped = [
+            int(pid) for pid in children if b"companion.flight.process" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        ]
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(self._random.uniform(self._shortest, self._longest))
+        for pid in stopped:
+            os.kill(pid, signal.SIGCONT)
+        self._next_s = math.nan
+
+
+def fly(session: Session, row: Row, words: list[str], folder: Path, stalls: Stalls | None = None) -> dict[str, Any]:
     """One flight, from wherever the vehicle is; returns its summary with what the simulator knows."""
     session.wind(row.wind_m_s, 0.0)
     time.sleep(SETTLE_S)
@@ -189,6 +228,9 @@ def fly(session: Session, row: Row, words: list[str], folder: Path) -> dict[str,
                 time.sleep(0.05)
                 if math.isnan(engaged_s) and session.offboard:
                     engaged_s = session.now_s
+                if stalls is not None and session.offboard:
+                    with contextlib.suppress(OSError):  # it may end at any moment
+                        stalls.turn(flight.pid, time.monotonic())
                 if row.step_m_s and math.isnan(step_s) and session.now_s - engaged_s >= STEP_AT_S:
                     session.wind(0.0, row.step_m_s)
                     step_s = session.now_s
@@ -284,6 +326,13 @@ def arguments() -> argparse.Namespace:
         "--set", nargs="+", default=[], metavar="KEY=VALUE", help="of the vehicle file, for experiments"
     )
     parser.add_argument("--px4-set", nargs="+", default=[], metavar="NAME=VALUE", help="PX4's parameters")
+    parser.add_argument(
+        "--stall",
+        nargs=3,
+        type=float,
+        metavar="S",
+        help="stop the control process in flight: for at least and at most so long, every so often on average",
+    )
     parser.add_argument("--out", type=Path, help="folder for the flights; default ./flights/px4-<UTC>")
     parser.add_argument("--json", action="store_true", help="print one JSON document at the end instead")
     return parser.parse_args()
@@ -311,7 +360,7 @@ def main() -> int:
                 folder = out / f"{name}-{controller}"
                 output = {"controller": controller} | ({"kind": options.output} if controller == "law" else {})
                 words = flight_files(out, folder.name, row, vehicle, output)
-                summary = fly(session, row, words, folder)
+                summary = fly(session, row, words, folder, Stalls(options.stall) if options.stall else None)
                 if summary.get("steps"):
                     summary["flown_peak_m_s"] = flown_peak(folder)
                 short = short or (controller == "law" and bool(misses(row, summary)))
