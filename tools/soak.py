@@ -26,6 +26,8 @@ from companion.flight.bundled import BundledVehicle
 from companion.flight.launch import control, prepare
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 
+WHOLE = 0.9
+"""Of the steps that a flight should have: with fewer it was none of that length."""
 CONTROL, RECORDER = "companion.flight.process", "companion.record"
 FAULTS = """description = "mild"
 [[fault]]
@@ -153,6 +155,8 @@ def soak(seconds: float, *, real_time: bool, rate_hz: float, engine: str, out: P
     wall_s = time.monotonic() - begin_s
     record = FlightRecord.load(folder / RECORD_FILE)
     steps = [float(x) for x in record.column("step_us")]
+    if len(steps) < WHOLE * seconds * rate_hz:
+        raise SystemExit(f"soak: only {len(steps)} steps were flown, nothing can be said: {flown.sentence}")
     before, after = quarters(steps)
     found: dict[str, Any] = {
         **{"sentence": flown.sentence, "seconds": seconds, "real_time": real_time, "wall_s": round(wall_s, 1)},
