@@ -85,6 +85,9 @@ tr.bad td:last-child { color: var(--bad); font-weight: 600; }
   .figure h2, .caption { padding: 0 6px; }
   .tiles { grid-template-columns: repeat(2, 1fr); gap: 8px; }
   h1 { font-size: 23px; }
+  table { display: block; overflow-x: auto; font-size: 12.5px; }
+  .listing table { display: table; }
+  th, td { padding-right: 9px; }
 }
 @media print {
   @page { margin: 14mm; }
