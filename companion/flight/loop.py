@@ -73,6 +73,8 @@ LOCKSTEP_SPIN_S = 0.0005
 HEARTBEAT_INTERVAL_S = 1.0
 IDLE_WAIT_S = 0.1
 BUSY_WAIT_S = 0.01
+AWAY_NS = 25_000_000
+"""A turn that lasts longer while setpoints are due: this process itself was stopped, and not the link silent."""
 
 
 class FlightLoop:
@@ -155,7 +157,7 @@ class FlightLoop:
         self._accounting = self._accounts(flight)
         self._heartbeat_s = -math.inf
         self._requests: list[tuple[Timesync, Frame]] = []
-        self._begun_ns = self._heard_ns = self._spoken_ns = time.monotonic_ns()
+        self._turned_ns = self._begun_ns = self._heard_ns = self._spoken_ns = time.monotonic_ns()
         self._known_ns: int | None = None
 
     # -- from outside ---------------------------------------------------------------------------------------------
@@ -327,6 +329,7 @@ class FlightLoop:
     # -- one turn -------------------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
+        self._turned_ns = time.monotonic_ns()
         for frame in self._wire.receive(self._wait_s(), LOCKSTEP_SPIN_S if self._peer.paced else 0.0):
             self._on_frame(frame)
         if not self._peer.paced:
@@ -455,7 +458,8 @@ class FlightLoop:
             self._ops.ask_time(wall_ns)
         # A better estimate of the vehicle's clock is no silence: only a vehicle in lockstep is judged by its own time.
         silent_s = now_s - self._last_state_s if self._peer.paced else (wall_ns - self._last_arrival_ns) * 1e-9
-        if sequence.duty is not Duty.NOTHING and silent_s > self._silence_s:
+        away = wall_ns - self._turned_ns > AWAY_NS and not self._peer.paced  # then states wait to be read: look first
+        if sequence.duty is not Duty.NOTHING and silent_s > self._silence_s and not away:
             self._stop_answering(Cause.STATE_LOST, f"none for {self._silence_s * 1e3:.0f} ms", now_s)
         sequence.tick(now_s)
 

@@ -252,6 +252,25 @@ def test_states_that_cease(flight: Flight, wire: VirtualWire) -> None:
     assert wire.vehicle.autopilot.mode is Mode.HOLD
 
 
+def test_a_process_that_was_stopped_looks_at_what_waits_before_it_judges_the_link(
+    flight: Flight, wire: VirtualWire
+) -> None:
+    """Stopped for 150 ms between a setpoint and the look at the clock: states have come, they are only not read."""
+    send, stopped = wire.send, []
+
+    def sending(msgid: int, payload: bytes) -> bool:
+        done = send(msgid, payload)
+        if msgid == codec.ID_SET_ATTITUDE_TARGET and wire.offboard_s >= 0.8 and not stopped:
+            stopped.append(wire.offboard_s)
+            wire._advance_to(wire.now_ns + 150_000_000)
+        return done
+
+    wire.send = sending  # type: ignore[method-assign]
+    outcome, _ = fly(flight, wire)
+    assert stopped
+    assert outcome.cause is Cause.COMPLETED, outcome.sentence
+
+
 def test_vehicle_that_is_gone(flight: Flight, wire: VirtualWire) -> None:
     """Nothing answers any more: the same, and an end after the hand-over has been tried for 3 s."""
 
