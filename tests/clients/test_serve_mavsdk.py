@@ -15,8 +15,7 @@ import pytest
 pytest.importorskip("mavsdk", reason="the MAVSDK package is not installed")
 sys.path.insert(0, str(Path(__file__).parents[1] / "loopback"))
 
-from flight_cases import Stand, make_flight
-from serve_cases import Serving
+from serve_cases import serving
 
 from sim_link.modes import Mode
 
@@ -24,7 +23,7 @@ CLIENT = Path(__file__).with_name("serve_client.py")
 
 
 def test_a_flight(tmp_path: Path) -> None:
-    with Stand(make_flight(), tmp_path) as stand, Serving(tmp_path, stand.port, ("hover",)) as serve:
+    with serving(tmp_path, ("hover",)) as (serve, stand):
         with serve.client():
             pass
         command = [sys.executable, str(CLIENT), str(serve.port)]

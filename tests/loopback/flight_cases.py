@@ -11,6 +11,7 @@ import math
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -142,6 +143,8 @@ class Stand:
         self.offboard_us: int | None = None
         self.alter = alter
         self.deaf: Callable[[Stand, Any], bool] = lambda stand, frame: False
+        self.idle_s = 0.0
+        """Between two states outside of OFFBOARD: in lockstep a vehicle that waits would use up a processor."""
         self._things: list[tuple[float, Callable[[], object]]] = []
         self._decoder = codec.Decoder()
         self._stopping = False
@@ -192,6 +195,8 @@ class Stand:
     def _sending(self, outbox: list[bytes]) -> None:
         if self.offboard_us is None and self.mode is Mode.OFFBOARD:
             self.offboard_us = self.t_us
+        if self.idle_s and self.mode is not Mode.OFFBOARD:
+            time.sleep(self.idle_s)
         due = [thing for thing in self._things if thing[0] <= self.offboard_s]
         for thing in due:
             self._things.remove(thing)

@@ -24,7 +24,9 @@ from companion.ground.client import Client
 
 PATIENCE_S = 60.0
 LONG_HOVER = dict(HOVER) | {"duration_s": 200.0}
-LONG_CIRCLE = read_toml(find("circle", "trajectories")) | {"laps": 8}
+SLOW = {"radius_m": 1.0, "angular_rate_rad_s": 0.5}
+"""The way to a slow circle is short."""
+LONG_CIRCLE = read_toml(find("circle", "trajectories")) | {"laps": 12, "circle": SLOW}
 SHORT_HOVER = dict(HOVER) | {"duration_s": 15.0}
 TRAJECTORIES: dict[str, dict[str, Any]] = {"circle": LONG_CIRCLE, "hover": LONG_HOVER, "short": SHORT_HOVER}
 
@@ -121,9 +123,21 @@ class Serving:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, **stand_options: Any) -> Iterator[tuple[Serving, Stand]]:
-    """A vehicle in the air and the companion that serves it."""
-    with Stand(make_flight(), folder, **stand_options) as stand, Serving(folder, stand.port) as serve:
+def serving(
+    folder: Path, names: tuple[str, ...] = ("circle", "hover"), **stand_options: Any
+) -> Iterator[tuple[Serving, Stand]]:
+    """A vehicle in the air and the companion that serves it.
+
+    The vehicle comes when the trajectories are checked: in lockstep both would use up the processors meanwhile.
+    """
+    stand = Stand(make_flight(), folder, **stand_options)
+    stand.idle_s = 0.002
+    with contextlib.ExitStack() as stack:
+        stack.callback(stand.peer.close)
+        serve = stack.enter_context(Serving(folder, stand.port, names))
+        with Client(serve.to, PATIENCE_S) as client:
+            until(lambda: all(t.accepted for t in client.trajectories()), "the trajectories are not checked")
+        stack.enter_context(stand)
         yield serve, stand
 
 

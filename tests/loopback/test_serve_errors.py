@@ -8,8 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from flight_cases import Stand, make_flight
-from serve_cases import Serving, until
+from serve_cases import serving, until
 
 from companion import Client
 from companion.cli import main
@@ -71,7 +70,7 @@ def test_a_port_in_use_ends_it_at_once(
 
 def test_the_supervisor_killed(tmp_path: Path) -> None:
     """The flight goes on to its end; then nothing is left."""
-    with Stand(make_flight(), tmp_path) as stand, Serving(tmp_path, stand.port, ("short",)) as serve:
+    with serving(tmp_path, ("short",)) as (serve, stand):
         with serve.client() as client:
             client.start("short")
             client.wait_for("track")

@@ -26,7 +26,7 @@ INT32, REAL32 = 6, 9
 
 @pytest.fixture
 def both(tmp_path: Any) -> Iterator[tuple[Serving, Stand]]:
-    with serving(tmp_path) as (serve, stand):
+    with serving(tmp_path, ("circle",)) as (serve, stand):
         yield serve, stand
 
 
