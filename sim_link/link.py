@@ -115,6 +115,10 @@ class Link:
         self._next_us = next_us
         return ids
 
+    def due_without_fail(self, now_us: int, period_us: int) -> Sequence[int] | None:
+        """Give the messages to send then if those are the ones of every state; None where others may be due too."""
+        return self._every_state if now_us < self._next_us and period_us == self._period_us else None
+
     def _sort(self, period_us: int) -> None:
         """Tell the messages of every state from those that are due now and then."""
         self._period_us = period_us

@@ -7,7 +7,8 @@ ones pymavlink objects.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from . import codec
@@ -89,6 +90,16 @@ class Telemetry:
         self._t_us = t_us
         self._estimate = estimate
         self.rates = rates
+
+    @contextmanager
+    def at(self, t_us: int, estimate: Estimate) -> Iterator[None]:
+        """Build messages of another time for a moment."""
+        now = self._t_us, self._estimate
+        self._t_us, self._estimate = t_us, estimate
+        try:
+            yield
+        finally:
+            self._t_us, self._estimate = now
 
     @property
     def sample_us(self) -> int:

@@ -2,8 +2,9 @@
 
 Lockstep: after each state the vehicle asks with TIMESYNC (tc1 = 0, ts1 = its time), and its clock waits until the
 answer with that ts1 has come. What came before the answer is acted on first, in order; what comes after it belongs to
-the next state. No wall clock enters the simulation, so that the same seed and the same companion give the same flight
-to the byte.
+the next state. Where a state tells nothing but the past, and nothing that the answer holds can change it, it goes out
+as soon as the answer is seen, before the answer's setpoint is acted on. No wall clock enters the simulation, so that
+the same seed and the same companion give the same flight to the byte.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .codec import ID_SERIAL_CONTROL, ID_TIMESYNC, TIMESYNC, Frame, timesync
+from .codec import ID_SERIAL_CONTROL, ID_SET_ATTITUDE_TARGET, ID_TIMESYNC, TIMESYNC, Frame, timesync
 from .fault_shell import FaultShell
 from .intake import Intake, allowance
 from .link import Link
@@ -34,6 +35,8 @@ _SPIN_NEXT_S = 3.0e-5
 """The same once something of the companion has come: the rest follows closely."""
 _SPIN_REST_MAX = 127
 """States for which it sleeps at once after polling was in vain time and again: the companion needs the processor."""
+_SETPOINT_AND_ANSWER = 2
+"""Messages of the usual answer."""
 _AT_ONCE = 64
 """Of the companion's datagrams so many are acted on in lockstep before the clock and `stopped` are looked at."""
 _LATE_MAX_S = 0.25
@@ -128,7 +131,9 @@ class Peer:
         """States for which sleeping at once is the better choice, when polling was in vain last."""
         self._spin_rest = 0
         """How many of them are left."""
-        self._awaited_ns = -1
+        self._awaited_ns = self._ahead_ns = -1
+        """Which states' answer is waited for, and which state went out ahead of its time last [ns]."""
+        self._last_us: int | None = None
         self._answered = False
         self._started = not options.lockstep
         self._deadline_s = time.monotonic()
@@ -141,7 +146,7 @@ class Peer:
 
     def run(self, duration_s: float | None = None) -> None:
         """Run until told to stop, or for a time of the vehicle's."""
-        end_us = None if duration_s is None else self.vehicle.start_us + round(duration_s * 1e6)
+        self._last_us = end_us = None if duration_s is None else self.vehicle.start_us + round(duration_s * 1e6)
         physics = self.vehicle.airframe  # its time goes on through a reboot
         if not self._started and not self._wait_for_companion():
             return
@@ -182,11 +187,13 @@ class Peer:
 
     def _send_state(self, t_us: int) -> None:
         """Send the messages of a state; in lockstep ask for the companion's answer to it."""
-        self._ticked_s = time.monotonic()
         if self.options.lockstep:
             self._awaited_ns = t_us * 1000
             self._answered = False
+            if self._ahead_ns == self._awaited_ns:  # it is out already
+                return
             self.vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._awaited_ns, 0, 0))
+        self._ticked_s = time.monotonic()
         self._flush()
 
     def close(self) -> None:
@@ -274,6 +281,7 @@ class Peer:
         while not self._answered:
             datagram = receive()
             if datagram is not None:
+                self._hurry(*datagram)
                 self._act(*datagram)
                 now_s = clock()
                 end_s = min(max(end_s, now_s + _SPIN_NEXT_S), give_up_s)
@@ -281,6 +289,30 @@ class Peer:
                 now_s = clock()
             if now_s > end_s:
                 return
+
+    def _hurry(self, found: list[Frame], sender: Address) -> None:
+        """Where a datagram is a setpoint and the answer to the present state, send the next state before acting on it.
+
+        The companion can go on at once then; the stream is the same as without.
+        """
+        if not self.synchronous or self._waiting or len(found) != _SETPOINT_AND_ANSWER or self._is_last():
+            return
+        setpoint, answer = found
+        if setpoint.msg_id != ID_SET_ATTITUDE_TARGET or answer.msg_id != ID_TIMESYNC:
+            return
+        tc1, ts1 = timesync(answer.payload)
+        if tc1 == 0 or ts1 != self._awaited_ns or sender != self.companion.partner:
+            return
+        t_us = self.vehicle.tell_ahead()
+        if t_us is not None:
+            self._ahead_ns = t_us * 1000
+            self._ticked_s = time.monotonic()
+            self.vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._ahead_ns, 0, 0))
+            self.companion.send(self.vehicle.companion.outbox)
+
+    def _is_last(self) -> bool:
+        """Whether no state comes after the present one."""
+        return self._last_us is not None and self.vehicle.airframe.t_us >= self._last_us
 
     def _wait_for_time(self) -> None:
         """Act on what comes until the wall clock has caught up with the vehicle's."""

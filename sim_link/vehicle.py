@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from .airframe import Airframe
 from .autopilot import Autopilot
@@ -32,6 +33,7 @@ from .loop_gains import LoopGains, make_gains
 from .messages import Telemetry, truth_payload
 from .messages_slow import SlowTelemetry
 from .missions import Plans
+from .modes import Mode
 from .offboard import Order
 from .parameter_set import DEFAULTS
 from .parameters import Parameters
@@ -126,6 +128,15 @@ class VehicleOptions:
     """The signing time that came with the key, in units of 10 us since 2015."""
 
 
+class Foretold(NamedTuple):
+    """A state's messages, built before it."""
+
+    t_us: int
+    """Its vehicle time."""
+    messages: list[tuple[int, bytes]]
+    """Ids and packed contents, for the companion link."""
+
+
 class Vehicle:
     """A vehicle with two links: `companion` and `ground`."""
 
@@ -173,6 +184,9 @@ class Vehicle:
         """HIL_STATE_QUATERNION frames with the truth."""
         self.asks_time = True
         """Whether TIMESYNC requests go out with the other messages (in lockstep the peer asks after each state)."""
+        self._foretold: Foretold | None = None
+        self._told_ahead_us = -1
+        """Vehicle time of the last state whose messages went out before its `tick`."""
         self._truth_link = Link(self.system, {}, self.airframe.t_us)
         self._truth_us = self.airframe.t_us
         self._truth_v = self.airframe.rigid.v
@@ -268,7 +282,8 @@ class Vehicle:
         if early:
             believed = self._dated(airframe.believed(self.steps_per_tick))
             self.telemetry.update(now_us, believed, self.telemetry.rates)
-            self._publish(due, now_us)
+            if self._told_ahead_us != now_us:
+                self._publish(due, now_us)
             queued(now_us)
         left = self.steps_per_tick
         while left > 0:
@@ -294,9 +309,56 @@ class Vehicle:
             self._publish_truth(self.t_us)
 
     def look_ahead(self) -> None:
-        """Prepare the next state's estimate, as far as it is known: done while there is nothing else to do."""
-        if self.steps_per_tick <= self.airframe.age_steps:
-            self.airframe.believed(self.steps_per_tick)
+        """Prepare the next state, as far as it is known: done while there is nothing else to do."""
+        self._foretold = None
+        if self.steps_per_tick > self.airframe.age_steps:
+            return
+        estimate = self.airframe.believed(self.steps_per_tick)
+        now_us = self.t_us + self.period_us
+        if self._undisturbed():
+            ids, *others = [link.due_without_fail(now_us, self.period_us) for link in self.links]
+            if ids is not None and all(none == [] for none in others) and _OF_THE_PAST.issuperset(ids):
+                self._foretold = self._foretell(ids, estimate, now_us)
+
+    def _undisturbed(self) -> bool:
+        """Whether nothing is about to happen to the estimate, the autopilot's program, or what it has to say."""
+        airframe = self.airframe
+        beliefs = airframe.beliefs
+        return not (
+            self.booting
+            or self.autopilot.texts
+            or airframe.t_us >= self.faults.next_us
+            or beliefs.active
+            or beliefs.version != self._beliefs_version
+        )
+
+    def _foretell(self, ids: Sequence[int], estimate: Estimate, now_us: int) -> Foretold | None:
+        """Build the messages of the next state; what is told to whoever asks before it stays as it is."""
+        telemetry = self.telemetry
+        with telemetry.at(now_us, self._dated(estimate)):
+            contents = [(msg_id, telemetry.build(msg_id)) for msg_id in ids if msg_id != ID_TIMESYNC]
+        packed = [(msg_id, content) for msg_id, content in contents if isinstance(content, bytes)]
+        return Foretold(now_us, packed) if len(packed) == len(contents) and not self.asks_time else None
+
+    def tell_ahead(self) -> int | None:
+        """Queue the messages of the next state now, if nothing that may still happen before it can change them.
+
+        That is so while the companion flies the vehicle and nothing else goes on: its setpoint acts on the motion, and
+        what is told is the past. Gives the vehicle time of that state, or None: it must wait for `tick`.
+        """
+        foretold, autopilot = self._foretold, self.autopilot
+        if foretold is None or not self._undisturbed():
+            return None
+        if autopilot.mode is not Mode.OFFBOARD or not (autopilot.armed and autopilot.offboard_ok):
+            return None
+        for link in self.links:
+            busy = link.outbox or link.parameters_to_send or link.faults is not None
+            if busy or link.due_without_fail(foretold.t_us, self.period_us) is None:
+                return None
+        for msg_id, content in foretold.messages:
+            self.companion.send_hot(msg_id, content)
+        self._told_ahead_us = foretold.t_us
+        return foretold.t_us
 
     def _tell_the_past(self, due: list[Sequence[int]]) -> bool:
         """Tell whether the messages that are due hold nothing of the present motion."""

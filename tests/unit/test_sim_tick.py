@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import socket
+
 import pytest
 
-from sim_link.codec import ID_ATTITUDE_TARGET, ID_ODOMETRY, frames
+from sim_link.autopilot import Result
+from sim_link.codec import (
+    ID_ATTITUDE_TARGET,
+    ID_ODOMETRY,
+    ID_SET_ATTITUDE_TARGET,
+    ID_TIMESYNC,
+    SET_ATTITUDE_TARGET,
+    TIMESYNC,
+    Encoder,
+    frames,
+    mavlink,
+    timesync,
+)
+from sim_link.modes import Mode
 from sim_link.peer import Peer, PeerOptions
 from sim_link.vehicle import Vehicle, VehicleOptions
 from sim_link.vehicle_file import load
@@ -56,6 +72,57 @@ def test_messages_of_the_present_wait_for_the_move() -> None:
     out, early = sent(v, 20)
     assert early == 0
     assert all(any(frame.msg_id == ID_ATTITUDE_TARGET for raw in tick for frame in frames(raw)) for tick in out)
+
+
+def flown(states: int, *, hurries: bool) -> tuple[bytes, object, int]:
+    """Fly in lockstep with a companion of few words; gives what it received, the truth, and the states told ahead."""
+    v = in_air()
+    ahead = [0]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as companion:
+        companion.bind(("127.0.0.1", 0))
+        companion.settimeout(5.0)
+        peer = Peer(v, PeerOptions(port=0, remote_port=companion.getsockname()[1], lockstep=True))
+        tell_ahead = v.tell_ahead
+
+        def told() -> int | None:
+            t_us = tell_ahead() if hurries else None
+            ahead[0] += t_us is not None
+            return t_us
+
+        v.tell_ahead = told  # type: ignore[method-assign]
+        heard, encoder = b"", Encoder(1, 191)
+        try:
+            for k in range(states):
+                peer._advance()
+                asked = None
+                while asked is None:
+                    datagram = companion.recv(2048)
+                    heard += datagram
+                    asked = next((timesync(f.payload)[1] for f in frames(datagram) if f.msg_id == ID_TIMESYNC), None)
+                if k == 200:
+                    assert v.autopilot.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+                thrust = 0.5 + 0.2 * math.sin(0.1 * k)
+                setpoint = (0, 1.0, 0.0, 0.0, 0.0, 0.1, -0.05, 0.02, thrust, 1, 1, 128, 0.0, 0.0, 0.0)
+                answer = encoder.hot(ID_SET_ATTITUDE_TARGET, SET_ATTITUDE_TARGET.pack(*setpoint))
+                if k % 50 == 7:  # somebody asks for something now and then
+                    answer += encoder.cold(mavlink.MAVLink_param_request_read_message(1, 1, b"MC_ROLL_P", -1))
+                answer += encoder.hot(ID_TIMESYNC, TIMESYNC.pack(asked + 1, asked, 1, 1))
+                companion.sendto(answer, ("127.0.0.1", peer.companion.port))
+                peer._spin(5.0)
+                assert peer._answered
+                peer._flush()
+        finally:
+            peer.close()
+    return heard, v.airframe.truth(), ahead[0]
+
+
+def test_states_told_before_the_setpoint_is_acted_on_are_the_same() -> None:
+    hurried, hurried_truth, ahead = flown(600, hurries=True)
+    usual, usual_truth, none = flown(600, hurries=False)
+    assert ahead > 200
+    assert none == 0
+    assert hurried == usual
+    assert hurried_truth == usual_truth
 
 
 def test_polling_in_vain_makes_room_for_the_companion(monkeypatch: pytest.MonkeyPatch) -> None:
