@@ -23,8 +23,6 @@ SIGNATURE_BYTES: Final = 13
 
 _HEADER_V2 = struct.Struct("<BBBBBBBHB")
 _ANY_MAGIC = re.compile(b"[\xfd\xfe]")
-_WHOLE_V2 = 12
-"""Bytes of a MAVLink 2 frame around its payload."""
 _UNFINISHED = -1
 _ZEROS = bytes(256)
 _CRC_EXTRA = [bytes((value,)) for value in range(256)]
@@ -147,8 +145,6 @@ class FrameParser:
         """
         at = 0
         end = len(data)
-        if self._guard is None:  # nearly always: whole unsigned frames of MAVLink 2, one behind the other
-            at = self._parse_usual(data, end, wall_ns, frames)
         while at < end:
             length = _length(data, at, end)
             if length == _UNFINISHED and not final:
@@ -163,29 +159,6 @@ class FrameParser:
             to = end if found is None else found.start()
             self._counters.garbage_bytes += to - at
             at = to
-        return at
-
-    def _parse_usual(self, data: bytes, end: int, wall_ns: int, frames: list[Frame]) -> int:
-        """Append the good frames that data begins with; return where the first one begins that needs a closer look."""
-        at, formats, count = 0, self._formats, self._count
-        while end - at >= _WHOLE_V2:
-            length = data[at + 1]
-            stop = at + 10 + length
-            if data[at] != MAGIC_V2 or data[at + 2] or stop + 2 > end:
-                break
-            msgid = data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16
-            known = formats.get(msgid)
-            if known is None:
-                break
-            if mcrf4xx(data[at + 1 : stop] + _CRC_EXTRA[known[0]]) != data[stop] | data[stop + 1] << 8:
-                break
-            payload = data[at + 10 : stop]
-            if length < known[1]:
-                payload += _ZEROS[: known[1] - length]
-            seq, sysid, compid = data[at + 4], data[at + 5], data[at + 6]
-            count(sysid, compid, seq)
-            frames.append(Frame(msgid, sysid, compid, seq, payload, data[at : stop + 2], wall_ns))
-            at = stop + 2
         return at
 
     def _take(self, raw: bytes, following: int, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> bool:
@@ -228,9 +201,6 @@ class FrameParser:
             self._counters.lost[sender] = 0
         else:
             step = (seq - last) & 0xFF
-            if step == 1:
-                self._last_seq[sender] = seq
-                return
             if step == 0 or step >= _REORDERED:
                 return
             if step > 1:
