@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from companion.config import Flight
 from companion.control import flat
-from companion.control.types import Quat, Vec3
+from companion.control.types import Quat, Reference, Vec3
 from companion.flight.clock import VehicleClock
 from companion.flight.course import Course
 from companion.flight.guards import Finding
@@ -70,6 +70,18 @@ class FlownStep(NamedTuple):
     arrival_ns: int
 
 
+class Measured(NamedTuple):
+    """What is worked out of a step once, for its row, its judgement and the display."""
+
+    reference: Reference
+    """At the state's stamp."""
+    error: Vec3
+    """Position less reference, NED [m]."""
+    timing: StepTiming
+    age_s: float | None
+    """Of the state at its arrival [s]; None where no clock tells it."""
+
+
 class Accounting:
     """Keeps the accounts of one flight.
 
@@ -98,68 +110,67 @@ class Accounting:
         self._progress = progress
         self._late_ns = int(LATE_SHARE / flight.vehicle.link.state_rate_hz * 1e9)
         self._shown_ns = 0
-        self.asked_ns: int | None = None
-        """The vehicle's time when it last asked for our answer in lockstep [ns]; None elsewhere."""
 
-    def settle(self, step: FlownStep, sent_ns: int, state_s: float) -> Finding | None:
-        """Records and judges a step; what is to be done about it.
+    def measure(self, step: FlownStep, sent_ns: int, asked_ns: int | None) -> Measured:
+        """Works out how a step went.
 
         Args:
             step: that was flown.
             sent_ns: when its setpoint went out, `time.monotonic_ns()`.
-            state_s: vehicle time at the arrival of its state [s].
+            asked_ns: the vehicle's time when it asked for our answer in lockstep [ns]; None elsewhere.
         """
-        state = step.state
+        state, arrival_ns, took_ns = step.state, step.arrival_ns, sent_ns - step.arrival_ns
         reference = step.course.at(step.course_s)
         p, d = state.p, reference.p
-        error = (p[0] - d[0], p[1] - d[1], p[2] - d[2])
+        age_s: float | None
+        if asked_ns is not None:
+            age_ns = asked_ns - state.t_vehicle_us * 1000
+            age_s, sent_age_ms = age_ns * 1e-9, (age_ns + took_ns) * 1e-6
+        else:
+            age_s = self._watch.age_s(state.t_vehicle_us, arrival_ns)
+            sent_age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
+        timing = StepTiming(sent_age_ms, took_ns * 1e-3, took_ns > self._late_ns, step.skipped)
+        return Measured(reference, (p[0] - d[0], p[1] - d[1], p[2] - d[2]), timing, age_s)
+
+    def settle(self, step: FlownStep, measured: Measured, state_s: float) -> Finding | None:
+        """Records and judges a step; what is to be done about it.
+
+        Args:
+            step: that was flown.
+            measured: how it went.
+            state_s: vehicle time at the arrival of its state [s].
+        """
+        reference, error, timing, age_s = measured
         shown_s = step.track_s if step.phase is Phase.TRACK else math.nan
-        timing = self._timing(state, step.skipped, step.arrival_ns, sent_ns)
-        self._record.append(control_row(shown_s, step.phase, state, reference, error, step.out, timing))
-        seen = Seen(
-            state, error, step.out, step.skipped, timing.late, self._age_s(step), step.arrival_ns, self._peer.paced
-        )
+        self._record.append(control_row(shown_s, step.phase, step.state, reference, error, step.out, timing))
+        paced = self._peer.paced
+        seen = Seen(step.state, error, step.out, step.skipped, timing.late, age_s, step.arrival_ns, paced)
         return self._watch.on_step(seen, step.course, state_s)
 
-    def show(self, step: FlownStep, sent_ns: int) -> bool:
+    def show(self, step: FlownStep, measured: Measured, sent_ns: int) -> bool:
         """Shows people how the flight stands, when it is time for that. Returns whether it was."""
         if sent_ns - self._shown_ns <= PROGRESS_NS:
             return False
         self._shown_ns = sent_ns
-        self._progress(self._standing(step, self._timing(step.state, 0, step.arrival_ns, sent_ns).age_ms))
+        self._progress(self._standing(step, measured))
         return True
 
-    def _standing(self, step: FlownStep, age_ms: float) -> Progress:
+    def _standing(self, step: FlownStep, measured: Measured) -> Progress:
         course, n, state = step.course, step.out.numbers, step.state
-        reference_m = course.at(step.course_s).p
         north, east, down = n[flat.B_HAT]
         return Progress(
             phase=step.phase.value,
             t_s=step.track_s,
             duration_s=course.track_s,
-            error_m=math.dist(state.p, reference_m),
+            error_m=math.hypot(*measured.error),
             steps=len(self._record),
             to_go_s=max(0.0, course.duration_s - course.course_s(step.course_s)),
             lyapunov=n[flat.LYAPUNOV],
             disturbance_m_s2=(north, east, down),
             position_m=state.p,
             attitude=state.q,
-            reference_m=reference_m,
+            reference_m=measured.reference.p,
             thrust_n=n[flat.TOTAL],
-            state_age_ms=age_ms,
+            state_age_ms=measured.timing.age_ms,
             battery=self._autopilot.battery,
         )
-
-    def _age_s(self, step: FlownStep) -> float | None:
-        """How old the state was at its arrival [s]."""
-        if self.asked_ns is not None:
-            return (self.asked_ns - step.state.t_vehicle_us * 1000) * 1e-9
-        return self._watch.age_s(step.state.t_vehicle_us, step.arrival_ns)
-
-    def _timing(self, state: VehicleState, skipped: int, arrival_ns: int, sent_ns: int) -> StepTiming:
-        took_ns = sent_ns - arrival_ns
-        if self.asked_ns is not None:
-            age_ms = (self.asked_ns - state.t_vehicle_us * 1000 + took_ns) * 1e-6
-        else:
-            age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
-        return StepTiming(age_ms, took_ns * 1e-3, took_ns > self._late_ns, skipped)

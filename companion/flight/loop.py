@@ -153,6 +153,8 @@ class FlightLoop:
         self._unaccounted: FlownStep | None = None
         self._engagement: Engagement | None = None
         self._sent_ns = 0
+        self._asked_ns: int | None = None
+        """The vehicle's time when it last asked for our answer in lockstep [ns]; None elsewhere."""
         self._watch = Watch(flight, self._tracker, self._autopilot, notify)
         self._accounting = self._accounts(flight)
         self._heartbeat_s = -math.inf
@@ -293,8 +295,7 @@ class FlightLoop:
         offset = self._watch.offset
         self._watch = Watch(flight, self._tracker, self._autopilot, self._notify)
         self._watch.offset = offset
-        asked_ns, self._accounting = self._accounting.asked_ns, self._accounts(flight)
-        self._accounting.asked_ns = asked_ns
+        self._accounting = self._accounts(flight)
         self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz)
 
     def _accounts(self, flight: Flight) -> Accounting:
@@ -417,7 +418,7 @@ class FlightLoop:
         self._clock.on_timesync(message.ts1, frame.arrival_wall_ns)
         self._requests.append((message, frame))
         if self._peer.paced:
-            self._accounting.asked_ns = message.ts1
+            self._asked_ns = message.ts1
             self._sequence.preflight.meter.on_paced_request(message.ts1)
             self._wire.gather()
             try:
@@ -576,10 +577,11 @@ class FlightLoop:
             return
         if self._retuning is not None:
             self._retuning.tick()
-        finding = self._accounting.settle(step, self._sent_ns, self._last_state_s)
+        measured = self._accounting.measure(step, self._sent_ns, self._asked_ns)
+        finding = self._accounting.settle(step, measured, self._last_state_s)
         if finding is not None:
             respond(self._sequence, finding, self._last_state_s)
-        if self._accounting.show(step, self._sent_ns):
+        if self._accounting.show(step, measured, self._sent_ns):
             self._keep_ramps()
 
     def _send(self, setpoint: Setpoint, state: VehicleState) -> bool:

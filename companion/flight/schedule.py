@@ -20,6 +20,7 @@ from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S
 from companion.errors import InputError
 from companion.flight.adaptation import Adaptation, adapted
 from companion.flight.findings import Finding, Gate, passed, refused, warning
+from companion.flight.gates_state import JITTER_WANTED_S
 from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, loop_margins
 from companion.flight.measure import LinkFigures
 
@@ -29,7 +30,6 @@ RATE_WANTED: Final = 0.8
 """Share of the vehicle file's state rate below which the loop is another one than that of the file."""
 RATE_FLOOR: Final = 0.4
 """Below this share nothing is chosen: the gate of the state rate refuses."""
-JITTER_WANTED_S: Final = 0.010
 AGE_ROOM_S: Final = 0.010
 GAP_BORNE_S: Final = 0.15
 """A longer interval is not asked of the loop: gaps are rare, margins speak of every interval."""
@@ -47,7 +47,7 @@ def choose(flight: Flight, link: LinkFigures) -> Choice:
     """What to fly over a loop that was measured so."""
     gate, limit = Gate.LOOP_HEALTH, "as the vehicle file says, or certified as it is"
     kind = flight.output.kind
-    fixed = kind if kind != "auto" else "rates"
+    fixed = flight.output.by_law
     if flight.output.controller != "law" or link.rate_hz is None:
         return Choice(None, passed(gate, "not judged", limit, "the law does not fly, or nothing came to judge it by"))
     wrong = _wrong(flight.vehicle, link)
