@@ -50,6 +50,7 @@ from companion.link.telemetry import StateRejection, Telemetry, VehicleState
 from companion.link.timesync import PacedPeer
 from companion.link.version import AutopilotVersion
 from companion.link.wire import Wire
+from companion.realtime import take_priority
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.anchored import Trajectory
 
@@ -323,7 +324,9 @@ class FlightLoop:
             self._paced()
             for msgid in NOT_NEEDED:
                 self._ops.set_message_interval(msgid, STOP_MESSAGE, now_s)
-        elif isinstance(self._tracker, Tracker):  # in lockstep each state is answered before anything newer comes
+            return True
+        take_priority()  # in lockstep it would be taken from the vehicle, for which both wait
+        if isinstance(self._tracker, Tracker):  # in lockstep each state is answered before anything newer comes
             self._ops.set_message_interval(codec.ATTITUDE_QUATERNION, ATTITUDE_INTERVAL_US, now_s)
         return True
 

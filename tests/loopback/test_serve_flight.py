@@ -79,11 +79,15 @@ def test_our_commands(both: tuple[Serving, Stand], capsys: pytest.CaptureFixture
 
     code, document = run("start", "2")
     assert (code, document["done"], document["trajectory_id"]) == (0, "start 2", 2)
-    assert run("status")[1]["phase"] in {"join", "track"}
+    status = run("status")[1]
+    assert status["phase"] in {"join", "track"}
+    assert (status["trajectory_id"], status["trajectory"]) == (2, "hover.toml")
     code, message = run("start", "9")
     assert (code, "no trajectory has the id 9" in message) == (3, True)
     assert main(["status", "--to", serve.to]) == 0
-    assert "position error" in capsys.readouterr().out
+    screen = capsys.readouterr().out
+    assert "position error" in screen
+    assert "hover.toml" in screen
     assert run("stop")[0] == 0
     assert stand.mode is Mode.HOLD
 

@@ -1,11 +1,14 @@
-"""What `--realtime` asks of the system: every part in a process of its own, so that this one stays ordinary."""
+"""What is asked of the system, with and without `--realtime`: every part in a process of its own, so that this one stays ordinary."""
 
 import json
 import os
+import resource
 import subprocess
 import sys
 
 import pytest
+
+from companion import realtime
 
 ASK = """
 import json, os
@@ -71,3 +74,58 @@ def test_one_core_leaves_nothing_to_choose():
     found = asked("os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})")
     assert not found["taken"]["cores"]
     assert any("one core only" in sentence for sentence in found["sentences"])
+
+
+PRIORITY = """
+import json, os, threading
+from companion import realtime
+{before}
+taken = realtime.take_priority()
+reading, writing = os.pipe()
+child = os.fork()
+if child == 0:
+    os.write(writing, str(os.getpriority(os.PRIO_PROCESS, 0)).encode())
+    os._exit(0)
+os.waitpid(child, 0)
+threads = []
+thread = threading.Thread(target=lambda: threads.append(os.getpriority(os.PRIO_PROCESS, 0)))
+thread.start()
+thread.join()
+print(json.dumps([taken, os.getpriority(os.PRIO_PROCESS, 0), int(os.read(reading, 99)), threads[0]]))
+"""
+
+
+def priorities(before="") -> list:
+    command = [sys.executable, "-c", PRIORITY.format(before=before)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may always take a priority")
+def test_priority_is_for_the_calling_thread_alone():
+    assert priorities() == [True, realtime.NICENESS, 0, 0]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may have more priority already")
+def test_more_priority_is_not_given_up():
+    assert priorities("os.nice(-15)")[:2] == [True, -15]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="gives up root's capabilities")
+def test_priority_that_is_not_permitted_is_not_taken():
+    give_up = (
+        "import resource; resource.setrlimit(resource.RLIMIT_NICE, (0, 0)); os.setgid(65534); os.setuid(65534)\n"
+        "before = os.getpriority(os.PRIO_PROCESS, 0)"
+    )
+    taken, after, child, thread = priorities(give_up)
+    assert not taken
+    assert after == child == thread == os.getpriority(os.PRIO_PROCESS, 0)
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or resource.getrlimit(resource.RLIMIT_NICE)[1] < 30, reason="needs root and the limit"
+)
+def test_a_nice_limit_is_enough():
+    limited = "import resource; resource.setrlimit(resource.RLIMIT_NICE, (30, 30)); os.setgid(65534); os.setuid(65534)"
+    assert priorities(limited)[:2] == [True, realtime.NICENESS]
