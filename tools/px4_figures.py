@@ -40,6 +40,11 @@ STEP_M_S = 5.0
 BACK_WITHIN_M = 0.10
 FLIGHT_S = 240.0
 TAKEOFF_M = 8.0
+TRIES = 3
+"""Of a flight that a gate refuses or that ends for want of states: the machine may have been busy once. Every try keeps
+its folder, and the table says which it was."""
+MACHINE = ("refused by a gate", "no usable state")
+"""How a flight's end begins that may be the machine's."""
 SETTLE_S = 4.0
 """Between a change of the wind and the next flight."""
 EIGHT = {
@@ -305,6 +310,8 @@ def line(row: Row, controller: str, summary: dict[str, Any]) -> str:
         said += f" (peak {100 * summary['peak_m']:.1f} cm, back in {summary['back_s']:.2f} s)"
     if short and "ended" in short[0]:
         said += f" [{summary.get('ended') or summary['verdict']}]"
+    if summary["tries"] > 1:
+        said += f" (try {summary['tries']})"
     peak = summary.get("flown_peak_m_s")
     speed = "   -" if peak is None or math.isnan(peak) else f"{peak:4.1f}"
     return f"{row.title:28} {controller:4} {speed}  {'  '.join(numbers)}   {reach(row):28} {said}"
@@ -357,10 +364,14 @@ def main() -> int:
         for name in options.rows:
             row = ROWS[name]
             for controller in options.controllers:
-                folder = out / f"{name}-{controller}"
                 output = {"controller": controller} | ({"kind": options.output} if controller == "law" else {})
-                words = flight_files(out, folder.name, row, vehicle, output)
-                summary = fly(session, row, words, folder, Stalls(options.stall) if options.stall else None)
+                for again in range(TRIES):
+                    folder = out / (f"{name}-{controller}" + (f"-{again + 1}" if again else ""))
+                    words = flight_files(out, folder.name, row, vehicle, output)
+                    summary = fly(session, row, words, folder, Stalls(options.stall) if options.stall else None)
+                    summary["tries"] = again + 1
+                    if not str(summary.get("ended", "")).startswith(MACHINE):
+                        break
                 if summary.get("steps"):
                     summary["flown_peak_m_s"] = flown_peak(folder)
                 short = short or (controller == "law" and bool(misses(row, summary)))

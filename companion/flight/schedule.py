@@ -20,7 +20,7 @@ from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S
 from companion.errors import InputError
 from companion.flight.adaptation import Adaptation, adapted
 from companion.flight.findings import Finding, Gate, passed, refused, warning
-from companion.flight.gates_state import JITTER_WANTED_S
+from companion.flight.gates_state import JITTER_WANTED_S, SCHEDULED_RATE_FLOOR
 from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, loop_margins
 from companion.flight.measure import LinkFigures
 
@@ -28,8 +28,6 @@ SHARES: Final = (1.0, 0.85, 0.7, 0.6, 0.5)
 """Of the vehicle file's gains; the first that is certified is flown."""
 RATE_WANTED: Final = 0.8
 """Share of the vehicle file's state rate below which the loop is another one than that of the file."""
-RATE_FLOOR: Final = 0.4
-"""Below this share nothing is chosen: the gate of the state rate refuses."""
 AGE_ROOM_S: Final = 0.010
 GAP_BORNE_S: Final = 0.15
 """A longer interval is not asked of the loop: gaps are rare, margins speak of every interval."""
@@ -90,7 +88,7 @@ def _hopeless(vehicle: Vehicle, link: LinkFigures) -> bool:
     """Whether states are so rare or so old that the gates for that refuse, whatever would be flown."""
     assert link.rate_hz is not None
     old = link.age_s is not None and link.age_s > vehicle.link.state_age_s + STATE_AGE_ROOM_S
-    return link.rate_hz < RATE_FLOOR * vehicle.link.state_rate_hz or (old and not link.paced)
+    return link.rate_hz < SCHEDULED_RATE_FLOOR * vehicle.link.state_rate_hz or (old and not link.paced)
 
 
 def _candidates(kind: str, *, gaps: bool) -> Iterable[tuple[float, str]]:

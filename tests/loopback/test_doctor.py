@@ -137,7 +137,7 @@ def test_link_that_is_wrong_in_many_ways(tmp_path) -> None:
     says(
         found,
         {
-            Gate.STATE_RATE: ("refused", "80 Hz are required for the vehicle file's 100 Hz"),
+            Gate.STATE_RATE: ("refused", "80 Hz are required for the vehicle file's 100 Hz, 40 Hz with lower gains"),
             Gate.STATE_AGE: ("refused", "the vehicle file says 20 ms; set link.state_age_s"),
             Gate.STATE_JITTER: ("warning", "later than the promptest; look for what holds datagrams up"),
             Gate.STATE_GAPS: ("refused", "a flight ends after 50 ms"),
