@@ -86,7 +86,7 @@ class RingWriter(_Ring):
         self._closed = False
 
     def put(self, kind: int, content: bytes, wall_ns: int) -> bool:
-        """Hand over an entry; False when there is no room for it. Never waits.
+        """Hand over an entry; False when it was refused: no room. Never waits, never raises: no log is worth a flight.
 
         Args:
             kind: 0 to 255.
@@ -100,11 +100,15 @@ class RingWriter(_Ring):
                 self._numbers[_REFUSED] += 1
                 return False
             end = self._at + _HEAD + length
-        if length < _USUAL_BYTES:  # head and content in one call
-            _PACK[length](self._bytes, self._at, wall_ns, length, kind, content)
-        else:
-            _ENTRY.pack_into(self._bytes, self._at, wall_ns, length, kind)
-            self._bytes[end - length : end] = content
+        try:
+            if length < _USUAL_BYTES:  # head and content in one call
+                _PACK[length](self._bytes, self._at, wall_ns, length, kind, content)
+            else:
+                _ENTRY.pack_into(self._bytes, self._at, wall_ns, length, kind)
+                self._bytes[end - length : end] = content
+        except (struct.error, ValueError, TypeError):  # no entry, or a fault of ours
+            self._numbers[_REFUSED] += 1
+            return False
         self._at = end
         self._numbers[_WRITTEN] = self._before + end
         return True
@@ -114,10 +118,11 @@ class RingWriter(_Ring):
         if self._closed:
             return False
         at, free = self._at, self._size - (self._before + self._at - self._numbers[_READ])
-        skipped = self._size - at if at + wanted > self._size else 0
+        passes = at + wanted > self._size
+        skipped = self._size - at if passes else 0  # 0 too where the last entry ended with the ring
         if skipped + wanted > free:
             return False
-        if skipped:
+        if passes:
             if skipped >= _HEAD:
                 _ENTRY.pack_into(self._bytes, at, 0, _SKIP, 0)
             self._before += self._size

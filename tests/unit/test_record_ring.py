@@ -60,6 +60,25 @@ def test_a_full_ring_refuses_and_goes_on_once_there_is_room():
     assert not writer.put(0, bytes(101), 0)  # never fits
 
 
+def test_an_entry_may_end_where_the_ring_ends():
+    writer, reader = make(2 * 26)
+    for round_ in range(5):
+        for number in range(2):  # 13 bytes of head, 13 of content: two fill the ring to its last byte
+            assert writer.put(number, bytes(13), round_)
+        assert not writer.put(9, b"", 0)
+        assert list(reader.take_rest()) == [Entry(round_, 0, bytes(13)), Entry(round_, 1, bytes(13))]
+    assert (writer.refused, writer.waiting) == (5, 0)
+
+
+def test_what_is_no_entry_is_refused_and_does_not_raise():
+    writer, reader = make(100)
+    assert not writer.put(300, b"kinds have one byte", 0)
+    assert not writer.put(1, "text", 0)
+    assert writer.put(1, b"content", 0)
+    assert writer.refused == 2
+    assert [entry.content for entry in reader.take_rest()] == [b"content"]
+
+
 def test_a_closed_ring_refuses_and_counts():
     writer, reader = make(100)
     assert writer.put(0, b"0123456789", 0)
