@@ -1,4 +1,4 @@
-"""What is asked of the system, with and without `--realtime`: every part in a process of its own, so that this one stays ordinary."""
+"""What is asked of the system, with and without `--realtime`: each in a process of its own; this one stays ordinary."""
 
 import json
 import os
