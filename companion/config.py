@@ -431,6 +431,8 @@ def find(name: str, kind: str) -> Path:
     bundled = folder / f"{name}.toml"
     if "/" not in name and bundled.is_file():
         return bundled
+    if path.is_dir():
+        raise InputError(f"{name}: is a folder; a {_SINGULAR[kind]} file is wanted")
     known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
     raise InputError(f"no {_SINGULAR[kind]} file {name!r}: neither a path nor one of the bundled ones ({known})")
 

@@ -78,6 +78,7 @@ def test_what_the_command_line_does_not_know(refusal: Refusal, arguments: list[s
     [
         (["simulate", "papr"], "neither a path nor one of the bundled ones (eight, paper, waypoints, windtest)"),
         (["demo", "--flight", "papr"], "no flight file 'papr'"),
+        (["check", "/", "--vehicle", "bundled"], "/: is a folder; a trajectory file is wanted"),
         (["certify", "papr"], "file 'papr': neither a path nor one of the bundled ones"),
         (["fly", "papr", "--vehicle", "bundled"], "no trajectory file 'papr'"),
         (["fly", "circle", "--vehicle", "papr"], "no vehicle file 'papr': neither a path nor one of the bundled ones"),
