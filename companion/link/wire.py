@@ -273,13 +273,19 @@ class Wire:
     def tell(self) -> None:
         """Show the tap what came and went since the last time.
 
-        Whoever answers in a hurry calls it after the answer; otherwise the next `receive` does, or `close`.
+        Whoever answers in a hurry calls it after the answer; otherwise the next `receive` does, or `close`. What the
+        tap raises comes out once; it is shown nothing any more then, as the link is needed for the hand-over.
         """
         tap, untold = self._tap, self._untold
-        if tap is not None:
-            for entry in untold:
-                tap(*entry)
-        untold.clear()
+        try:
+            if tap is not None:
+                for entry in untold:
+                    tap(*entry)
+        except Exception:
+            self._tap = None
+            raise
+        finally:
+            untold.clear()
 
     def send(self, msgid: int, payload: bytes) -> bool:
         """Frame a payload and hand it to the system without waiting. False, and counted, when it did not go out.

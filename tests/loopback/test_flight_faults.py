@@ -320,9 +320,29 @@ def gives_nan(flying):
     flying._tracker.step = broken_step
 
 
+def breaks_the_log(flying):
+    """What sees all traffic raises, from the middle of the flight on."""
+    step, count = flying._tracker.step, [0]
+
+    def broken_step_of_the_log(*args):
+        raise BufferError("the log is broken")
+
+    def counted(*args, **options):
+        count[0] += 1
+        if count[0] == 150:
+            flying._wire._tap = broken_step_of_the_log
+        return step(*args, **options)
+
+    flying._tracker.step = counted
+
+
 @pytest.mark.parametrize(
     ("damage", "cause", "says"),
-    [(raises, Cause.FAULT, "ZeroDivisionError: float division by zero"), (gives_nan, Cause.UNSENDABLE, "nan is not")],
+    [
+        (raises, Cause.FAULT, "ZeroDivisionError: float division by zero"),
+        (gives_nan, Cause.UNSENDABLE, "nan is not"),
+        (breaks_the_log, Cause.FAULT, "BufferError: the log is broken; handed over to Hold"),
+    ],
 )
 def test_fault_of_the_program_still_hands_over(damage, cause: Cause, says: str, tmp_path) -> None:
     with Stand(make_flight(), tmp_path) as stand:
