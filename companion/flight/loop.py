@@ -50,7 +50,6 @@ from companion.link.telemetry import StateRejection, Telemetry, VehicleState
 from companion.link.timesync import PacedPeer
 from companion.link.version import AutopilotVersion
 from companion.link.wire import Wire
-from companion.realtime import take_priority
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.anchored import Trajectory
 
@@ -93,7 +92,7 @@ class FlightLoop:
         connection: what to call the link in explanations.
         system: the vehicle's system id, where it is known already.
         host: the program around it.
-        paced: called once when it is known that the vehicle waits for us (lockstep).
+        paced: called once when it is known whether the vehicle waits for us (lockstep), with that.
         engaged: called when the controller takes over, and again after its course's pace was changed; must not block.
         only_gates: nothing is flown: it ends when the gates have judged.
     """
@@ -113,7 +112,7 @@ class FlightLoop:
         host: Host | None = None,
         engaged: Callable[[Engagement], None] = lambda engagement: None,
         only_gates: bool = False,
-        paced: Callable[[], None] = lambda: None,
+        paced: Callable[[bool], None] = lambda waits: None,
     ) -> None:
         self._flight = flight
         self._trajectory = trajectory
@@ -320,13 +319,11 @@ class FlightLoop:
         peer = f"system {self._ops.target_system}{in_lockstep}"
         self._sequence.enter(Phase.CONNECT, now_s, f"heard the autopilot ({peer})")
         self._sequence.enter(Phase.PREFLIGHT, now_s, "asking for rates, version and parameters")
+        self._paced(self._peer.paced)
         if self._peer.paced:  # a simulated vehicle on a link of ours alone; elsewhere somebody may need them
-            self._paced()
             for msgid in NOT_NEEDED:
                 self._ops.set_message_interval(msgid, STOP_MESSAGE, now_s)
-            return True
-        take_priority()  # in lockstep it would be taken from the vehicle, for which both wait
-        if isinstance(self._tracker, Tracker):  # in lockstep each state is answered before anything newer comes
+        elif isinstance(self._tracker, Tracker):  # in lockstep each state is answered before anything newer comes
             self._ops.set_message_interval(codec.ATTITUDE_QUATERNION, ATTITUDE_INTERVAL_US, now_s)
         return True
 

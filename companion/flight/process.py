@@ -30,7 +30,7 @@ from companion.flight.tracker import Kernels, kernels
 from companion.link.framing import refused_since
 from companion.link.vehicle_link import VehicleLink
 from companion.link.wire import Wire
-from companion.realtime import prepare
+from companion.realtime import prepare, take_priority
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, write_summary
 from companion.record.recorder import Recorder
@@ -139,13 +139,19 @@ class Ready:
             status.line(line)
             self.recorder.note(line)
 
+        def pace(waits: bool) -> None:
+            if waits:
+                self.recorder.give_way()
+            else:  # in lockstep it would be taken from the vehicle, for which both wait
+                take_priority()
+
         return FlightLoop(
             *(self.flight, self.trajectory, wire, self.record, self.compiled, notify, status.progress),
             connect_timeout_s=timeout_s,
             connection=connection,
             system=system,
             host=host,
-            paced=self.recorder.give_way,
+            paced=pace,
             engaged=lambda engagement: self.recorder.state("engagement", json.dumps(asdict(engagement))),
         )
 
