@@ -253,6 +253,27 @@ def fly(session: Session, row: Row, words: list[str], folder: Path, stalls: Stal
     return summary
 
 
+def tried(
+    session: Session,
+    row: Row,
+    name: str,
+    out: Path,
+    vehicle: dict[str, Any],
+    output: dict[str, str],
+    stall: list[float] | None,
+) -> dict[str, Any]:
+    """The summary of a flight, tried again while its end may be the machine's; each try has a folder of its own."""
+    for number in range(1, TRIES + 1):
+        folder = out / (name if number == 1 else f"{name}-{number}")
+        words = flight_files(out, folder.name, row, vehicle, output)
+        summary = fly(session, row, words, folder, Stalls(stall) if stall else None)
+        if not str(summary.get("ended", "")).startswith(MACHINE):
+            break
+    if summary.get("steps"):
+        summary["flown_peak_m_s"] = flown_peak(folder)
+    return summary | {"tries": number}
+
+
 def flown_peak(folder: Path) -> float:
     """Largest speed in the statistics [m/s]."""
     record = read_source(folder).record
@@ -365,15 +386,7 @@ def main() -> int:
             row = ROWS[name]
             for controller in options.controllers:
                 output = {"controller": controller} | ({"kind": options.output} if controller == "law" else {})
-                for again in range(TRIES):
-                    folder = out / (f"{name}-{controller}" + (f"-{again + 1}" if again else ""))
-                    words = flight_files(out, folder.name, row, vehicle, output)
-                    summary = fly(session, row, words, folder, Stalls(options.stall) if options.stall else None)
-                    summary["tries"] = again + 1
-                    if not str(summary.get("ended", "")).startswith(MACHINE):
-                        break
-                if summary.get("steps"):
-                    summary["flown_peak_m_s"] = flown_peak(folder)
+                summary = tried(session, row, f"{name}-{controller}", out, vehicle, output, options.stall)
                 short = short or (controller == "law" and bool(misses(row, summary)))
                 results.append({"row": name, "controller": controller, "misses": misses(row, summary), **summary})
                 print(line(row, controller, summary), file=sys.stderr if options.json else sys.stdout, flush=True)

@@ -11,7 +11,8 @@ from companion.flight.measure import CLOCK_ERROR_MAX_S, silence_limit_s
 from companion.flight.phases import LandedState
 
 RATE_FLOOR: Final = 0.8
-"""Share of the vehicle file's state rate below which a flight is refused."""
+"""Share of the vehicle file's state rate below which the loop is another one than the file's: its gains are not
+flown over it."""
 SCHEDULED_RATE_FLOOR: Final = 0.4
 """The same where `flight.schedule` may lower the gains."""
 JITTER_WANTED_S: Final = 0.010
@@ -48,7 +49,7 @@ def state_rate(m: Measured) -> Finding:
     sentence = f"ODOMETRY comes at {shown}"
     if link.rate_hz < floor:
         why = f"{sentence}, {floor:.0f} Hz are required for the vehicle file's {wanted:.0f} Hz"
-        if m.flight.output.controller == "law" and m.flight.calibration is None:
+        if m.flight.output.controller == "law":
             why += f", {SCHEDULED_RATE_FLOOR * wanted:.0f} Hz with lower gains"
         return refused(gate, shown, limit, why, "check the link's data rate, or lower link.state_rate_hz and certify")
     return passed(gate, shown, limit, f"{sentence}, {wanted:.0f} Hz were asked for")

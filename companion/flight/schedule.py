@@ -20,14 +20,12 @@ from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S
 from companion.errors import InputError
 from companion.flight.adaptation import Adaptation, adapted
 from companion.flight.findings import Finding, Gate, passed, refused, warning
-from companion.flight.gates_state import JITTER_WANTED_S, SCHEDULED_RATE_FLOOR
+from companion.flight.gates_state import JITTER_WANTED_S, RATE_FLOOR, SCHEDULED_RATE_FLOOR
 from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, loop_margins
 from companion.flight.measure import LinkFigures
 
 SHARES: Final = (1.0, 0.85, 0.7, 0.6, 0.5)
 """Of the vehicle file's gains; the first that is certified is flown."""
-RATE_WANTED: Final = 0.8
-"""Share of the vehicle file's state rate below which the loop is another one than that of the file."""
 AGE_ROOM_S: Final = 0.010
 GAP_BORNE_S: Final = 0.15
 """A longer interval is not asked of the loop: gaps are rare, margins speak of every interval."""
@@ -73,7 +71,7 @@ def _wrong(vehicle: Vehicle, link: LinkFigures) -> list[str]:
     """In what the loop is worse than the vehicle file's, for people."""
     out, wanted = [], vehicle.link.state_rate_hz
     assert link.rate_hz is not None
-    if link.rate_hz < RATE_WANTED * wanted:
+    if link.rate_hz < RATE_FLOOR * wanted:
         out.append(f"states at {link.rate_hz:.0f} Hz, not {wanted:.0f}")
     if link.age_s is not None and link.age_s > vehicle.link.state_age_s + AGE_ROOM_S and not link.paced:
         out.append(f"states {link.age_s * 1e3:.0f} ms old, not {vehicle.link.state_age_s * 1e3:.0f}")
