@@ -1,6 +1,8 @@
 """Where the vehicle flies when it holds its own position: Hold, Takeoff, Mission, Land, Return, Position, Altitude.
 
 Gives position and velocity setpoints to the position controller; velocities follow a limited acceleration, as PX4's do.
+Stopping is flown along a way that begins at the present position and speed and ends at rest, so that wind which the
+controller has not learned yet does not carry the vehicle off (PX4: PositionSmoothing, started by FlightTaskAuto).
 """
 
 from __future__ import annotations
@@ -52,6 +54,8 @@ class Guidance:
         self._anchor: Vec3 | None = None
         self._yaw = 0.0
         self._v: Vec3 = (0.0, 0.0, 0.0)
+        self._way: Vec3 | None = None
+        """Where the vehicle should be while it stops; None: it does not."""
         self._ramp_s = 0.0
         self._takeoff_d = 0.0
         self._return_d = 0.0
@@ -71,6 +75,7 @@ class Guidance:
         self._yaw = yaw
         self._anchor = anchor
         self._v = v
+        self._way = None
         self._ramp_s = 0.0
         self.descending = False
         self.takeoff_done = False
@@ -184,7 +189,7 @@ class Guidance:
         return self._hold(p, v, dt_s)
 
     def _hold(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
-        """Stop, then stay where that was; or fly to where it was told to, and stay there."""
+        """Stop, then stay where the way to it ends; or fly to where it was told to, and stay there."""
         self._turn(self._target_yaw if self._target is not None else math.nan, dt_s)
         if self._target is not None and self._anchor is None:
             self._approach(self._target, p, dt_s)
@@ -193,10 +198,17 @@ class Guidance:
             return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, 0.0)
         if self._anchor is None:
             self._slew((0.0, 0.0, 0.0), dt_s)
-            if max(math.hypot(*v), math.hypot(*self._v)) > _STOPPED_M_S:
-                return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, 0.0)
-            self._anchor = p
+            way = self._go_on(p, dt_s)
+            if self._v != (0.0, 0.0, 0.0):
+                return PositionSetpoint(way, self._v, _NOTHING, self._yaw, 0.0)
+            self._anchor = way
         return PositionSetpoint(self._anchor, _NOTHING, _NOTHING, self._yaw, 0.0)
+
+    def _go_on(self, p: Vec3, dt_s: float) -> Vec3:
+        """Move the way's point on by the velocity setpoint; it begins at p."""
+        n, e, d = p if self._way is None else self._way
+        self._way = (n + self._v[0] * dt_s, e + self._v[1] * dt_s, d + self._v[2] * dt_s)
+        return self._way
 
     def _position(self, p: Vec3, v: Vec3, dt_s: float) -> PositionSetpoint:
         """Fly as fast as the sticks say; with centred ones stop, then stay where that was."""
@@ -209,7 +221,8 @@ class Guidance:
         if north or east or down or self._anchor is None:
             self._anchor = None
             self._slew((north, east, down), dt_s)
-            if north or east or down or max(math.hypot(*v), math.hypot(*self._v)) > _STOPPED_M_S:
+            # PX4 holds as soon as no speed is asked for any more, and a height when the climb is over.
+            if north or east or down or self._v != (0.0, 0.0, 0.0) or abs(v[2]) > _STOPPED_M_S:
                 return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, rate)
             self._anchor = p
         return PositionSetpoint(self._anchor, _NOTHING, _NOTHING, self._yaw, rate)
@@ -308,9 +321,10 @@ class Guidance:
         self.descending = True
         self._slew((0.0, 0.0, speed_m_s), dt_s)
         if self._anchor is None:
-            if max(math.hypot(v[0], v[1]), math.hypot(self._v[0], self._v[1])) > _STOPPED_M_S:
-                return PositionSetpoint(_NOTHING, self._v, _NOTHING, self._yaw, 0.0)
-            self._anchor = p
+            way = self._go_on(p, dt_s)
+            if self._v[:2] != (0.0, 0.0):
+                return PositionSetpoint((way[0], way[1], math.nan), self._v, _NOTHING, self._yaw, 0.0)
+            self._anchor = way
         horizontal = (self._anchor[0], self._anchor[1], math.nan)
         return PositionSetpoint(horizontal, (math.nan, math.nan, self._v[2]), _NOTHING, self._yaw, 0.0)
 
@@ -333,6 +347,7 @@ class Guidance:
 
     def _approach(self, target: Vec3, p: Vec3, dt_s: float) -> None:
         """Turn the velocity setpoint towards a point, slower when near it."""
+        self._way = None
         north, east, down = target[0] - p[0], target[1] - p[1], target[2] - p[2]
         distance = math.hypot(north, east)
         asked = self.mission.speed_m_s if self._mode is Mode.MISSION else None

@@ -17,6 +17,7 @@ from matrix_flight import Act, Happening, Stage
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.flight.phases import Phase
+from sim_link.fault_kinds import KINDS
 
 PHASES = (Phase.CONNECT, Phase.PREFLIGHT, Phase.TAKEOFF, Phase.JOIN, Phase.TRACK, Phase.HOLD, Phase.LAND)
 LATEST_S = {
@@ -201,15 +202,23 @@ def singles(seeds: tuple[int, ...] = SEEDS) -> Iterator[Job]:
                 yield Job((case.name,), phase.value, seed)
 
 
+def exclude_one_another(first: str, second: str) -> bool:
+    """Whether the vehicle can have only one of two different kinds at a time."""
+    groups = [KINDS[kind].group for kind in (first, second) if kind in KINDS]
+    return len(groups) == 2 and groups[0] == groups[1] != ""
+
+
 def pairs(seeds: tuple[int, ...] = SEEDS) -> Iterator[Job]:
     """Every pair of kinds once per seed, each with a drawn case of its kind, in a drawn phase.
 
-    Two of the same kind too, where there are two cases of it; pairs that the vehicle cannot have at once are left out.
+    Pairs that the vehicle cannot have at once, as an estimator that is silent and one that stands still, are left out.
     """
     kinds: dict[str, list[str]] = {}
     for case in CASES.values():
         kinds.setdefault(case.kind, []).append(case.name)
     for first, second in itertools.combinations(sorted(kinds), 2):
+        if exclude_one_another(first, second):
+            continue
         for seed in seeds:
             draw = random.Random(f"{first} {second} {seed}")
             names = draw.choice(kinds[first]), draw.choice(kinds[second])

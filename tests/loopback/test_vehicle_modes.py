@@ -148,6 +148,25 @@ def test_hold_stops_where_it_is_and_stays():
         assert math.dist(here, c.position) < 0.1
 
 
+@pytest.mark.parametrize("mode", [HOLD, LAND])
+def test_a_wind_that_the_autopilot_has_not_learned_does_not_carry_it_off_while_it_stops(mode):
+    """PX4 leads the vehicle to rest by a position, not by a speed alone: a push of 2 m/s^2 costs a metre, not four."""
+    from sim_link.wind import World
+
+    file = vehicle_file()
+    push = World(force_n=(0.0, 2.0 * file.mass_kg, 0.0))
+    leaning_against = (math.cos(0.1), -math.sin(0.1), 0.0, 0.0)
+    with Flight(start=IN_AIR, world=push, file=file) as c:
+        c.enter_offboard(7, q=leaning_against, thrust=0.51)
+        c.run(1.0)
+        c.silence()
+        assert c.set_mode(mode) == 0
+        begin, away_m = c.position[1], []
+        c.each = lambda: away_m.append(abs(c.position[1] - begin))
+        c.run(12.0)
+        assert 0.3 < max(away_m) < 1.5
+
+
 def test_set_mode_message_has_no_answer():
     with Flight(start=IN_AIR) as c:
         c.log.clear()
