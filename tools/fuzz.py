@@ -35,6 +35,9 @@ SHARES = {
 TOGETHER = 10_000_000
 HANG_S = 20
 MEMORY_MB = 900
+ASLEEP_FACTOR = 30
+"""With --blind an input may take HANG_S of the processor, and so many times as long by the clock: whoever stops this
+process for a while has found nothing."""
 GROWTH_MB = 300
 """With --blind: beyond what the first input needed."""
 TELL_S = 10.0
@@ -90,12 +93,14 @@ def fuzz_blindly(name: str, runs: int, seconds: int, hang_s: int, seed: int) -> 
     def hang(*_: object) -> None:
         raise TimeoutError(f"longer than {hang_s} s")
 
+    signal.signal(signal.SIGPROF, hang)
     signal.signal(signal.SIGALRM, hang)
     memory_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begun_s = told_s = time.monotonic()
     for number in range(runs):
         if number % 64 == 0:
-            signal.alarm(hang_s)
+            signal.setitimer(signal.ITIMER_PROF, hang_s)
+            signal.alarm(ASLEEP_FACTOR * hang_s)
             now_s = time.monotonic()
             if now_s - told_s > TELL_S:
                 told_s = now_s
