@@ -60,6 +60,23 @@ def take_priority() -> bool:
     return True
 
 
+def take_core_of_two(port: int) -> None:
+    """Keeps the calling thread off the core of a vehicle in lockstep, on a machine with two; `rejoin` ends it.
+
+    Two programs that wait for each other are never busy at the same time for long. A scheduler likes to put them on one
+    core, where each wake of the one stops the other, and a flight takes up to twice as long; with more cores it finds
+    idle ones. The vehicle does the same with the other core (`sim_link.cores`).
+
+    Args:
+        port: the UDP port at which the vehicle is heard: whose core is which goes by it, so that pairs are spread.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # not permitted; not Linux
+        cores = sorted(os.sched_getaffinity(0))
+        if len(cores) == 2:
+            os.sched_setaffinity(0, {cores[port % 2]})
+            os.environ[CORES_VARIABLE] = ",".join(map(str, cores))
+
+
 def prepare() -> list[Measure]:
     """Asks for all of it, for the calling thread and the memory of its process; never raises.
 

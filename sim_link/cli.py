@@ -28,6 +28,7 @@ from .cli_values import (
     tell,
     vector,
 )
+from .cores import take_core_of_two
 from .fault_file import load as load_faults
 from .fault_keys import FaultError
 from .fleet import SPACING_M, SYSTEMS_MAX, Fleet, siblings
@@ -183,6 +184,8 @@ def run(
     _announce(peers, json_ready)
     gc.collect()
     gc.freeze()
+    if lockstep:
+        take_core_of_two(all_ports[0].remote_port)
     try:
         runner.run(duration)
     finally:

@@ -28,9 +28,10 @@ from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.preflight import BASELINE_PARAMETERS, gate_gains
 from companion.flight.tracker import Kernels, kernels
 from companion.link.framing import refused_since
+from companion.link.transport import parse_connection
 from companion.link.vehicle_link import VehicleLink
 from companion.link.wire import Wire
-from companion.realtime import prepare, take_priority
+from companion.realtime import prepare, take_core_of_two, take_priority
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, write_summary
 from companion.record.recorder import Recorder
@@ -142,6 +143,7 @@ class Ready:
         def pace(waits: bool) -> None:
             if waits:
                 self.recorder.give_way()
+                take_core_of_two(parse_connection(connection).number)
             else:  # in lockstep it would be taken from the vehicle, for which both wait
                 take_priority()
 
