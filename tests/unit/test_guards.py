@@ -55,8 +55,9 @@ class Watched:
         return found
 
 
-def tilted(angle: float):
-    return (math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0)
+def tilted(angle: float, by_pitch: bool = False):
+    cosine, sine = math.cos(angle / 2), math.sin(angle / 2)
+    return (cosine, 0.0, sine, 0.0) if by_pitch else (cosine, sine, 0.0, 0.0)
 
 
 def stages(guard: Guard) -> list[tuple[float, Guard, Response]]:
@@ -68,6 +69,7 @@ def stages(guard: Guard) -> list[tuple[float, Guard, Response]]:
     [
         (Guard.POSITION_ERROR, {"error": (0.0, 101.0, 0.0), "q": LEVEL}),
         (Guard.TILT, {"q": tilted(1.01)}),
+        (Guard.TILT, {"q": tilted(1.01, by_pitch=True)}),
         (Guard.DISTURBANCE, {"n": numbers(LIMIT_DISTURBANCE, 5.9)}),
         (Guard.THRUST, {"n": numbers(LIMIT_THRUST_MAX)}),
         (Guard.RATES, {"n": numbers(LIMIT_ROLL_PITCH_RATE)}),
@@ -225,7 +227,8 @@ def test_rates_that_are_not_followed() -> None:
     watched = Watched()
     limit = VEHICLE.limits.rate_error_max_rad_s
     step = lambda off: watched.guards.step(LEVEL, (0.0, 0.0, 0.0), numbers(), watched.now_s, off)  # noqa: E731
-    for off, expected in ((0.99 * limit, None), (1.01 * limit, Guard.FOLLOWING)):
+    again = ((0.99 * limit, None), (1.01 * limit, Guard.FOLLOWING))
+    for off, expected in (*again, *again):
         found = []
         for _ in range(12):
             watched.now_s += STEP_S
@@ -246,4 +249,27 @@ def test_errors_at_the_start_and_after_a_reset_are_not_held_against_the_vehicle(
     assert [guard for _, guard, _ in found] == [Guard.RUNAWAY, Guard.LYAPUNOV]
     watched.steps(0.5)
     watched.guards.restart()
-    assert watched.steps(0.1, n=numbers(errors=spread(0.02, 2))) == []
+    assert watched.steps(0.2, n=numbers(errors=near)) == []
+
+
+def test_where_the_law_does_not_fly_its_envelope_is_nobodys_business() -> None:
+    guards = Guards(VEHICLE, None)
+    guards.restart()
+    far = numbers(errors=(20.0,) * 12)
+    assert all(guards.step(LEVEL, (20.0, 0.0, 0.0), far, STEP_S * i) is None for i in range(500))
+
+
+def test_what_it_says_has_the_figure_the_limit_and_how_long_it_lasted() -> None:
+    guards, limits = Guards(VEHICLE, PARAMETERS), VEHICLE.limits
+    finding = guards.step(LEVEL, (0.0, 123.4, 0.0), numbers(), 0.0)
+    assert finding is not None
+    limit = f"limit {limits.position_error_abort_m:.3g} (limits.position_error_abort_m)"
+    assert finding.detail == f"123 m, {limit}"
+    slow = [guards.slowly(Slow(state_rate_hz=100.0), 0.1 * i) for i in range(7)]
+    told = [finding.detail for finding in slow if finding is not None]
+    assert told == [f"100 Hz, limit {limits.state_rate_min * 250:.3g} (limits.state_rate_min) for 0.5 s"]
+
+
+def test_of_two_guards_that_ask_for_the_same_the_first_is_named() -> None:
+    found = Watched().steps(6.1, n=numbers(LIMIT_THRUST_MAX | LIMIT_ROLL_PITCH_RATE))
+    assert found[-1] == (pytest.approx(6.0, abs=0.011), Guard.THRUST, Response.HOLD)
