@@ -13,7 +13,7 @@ from companion.campaign.ideal import World, fly
 from companion.control import law
 from companion.control.certificate import inside_matrix, linear_loop
 from companion.control.heading import COMMANDED, DAMPING, SIDESLIP
-from companion.control.law import ControllerState, Limits, evaluate, step
+from companion.control.law import ControllerState, Gains, Limits, evaluate, step
 from companion.control.types import Reference, State
 from companion.control.vectors import axes, dot, norm, rotate_to_body, sub
 
@@ -89,6 +89,43 @@ def test_the_lyapunov_functions_fall_as_their_closed_forms_say(start, b_hat, dra
         expected = s @ (g.k1 * (e2 - s)) + e2 @ e2r + e3 @ e3r + e4 @ e4r - b_tilde @ rate / (g.k1 * g.gamma)
         measured = (far_after - far_before) / (2 * h)
     assert measured == pytest.approx(expected, rel=2e-5, abs=2e-5)
+
+
+@pytest.mark.parametrize("start", [(0.5, -0.4, -9.2), (25.0, -15.0, -18.0)], ids=["inside", "outside"])
+def test_what_the_heading_is_told_of_the_force_is_a_direction_and_its_two_derivatives(start, monkeypatch):
+    """Along the closed loop with a right estimate, with drag and with gains of which no two are alike: the derivatives
+    given against central differences of what they are derivatives of, and the errors' own rates likewise."""
+    drag, truth = 0.6, (0.3, -0.4, 0.2)
+    p = parameters(Gains(0.7, 3.5, 2.0, 4.5, 1.3, 5.0, SIDESLIP, 1.0, 1.0, 2.0), drag)
+    told = []
+    heard = law.heading_torque
+
+    def listen(state, ref, force, *rest):
+        told.append(force)
+        return heard(state, ref, force, *rest)
+
+    world = World((truth[0] * MASS, truth[1] * MASS, truth[2] * MASS), G, drag)
+    state = State(start, (0.3, 1.2, 0.2), (0.98, 0.1, -0.05, 0.16), (0.1, -0.2, 0.3))
+    h = 1e-3
+    times = 3.0 + h * np.arange(3)
+    begin = ControllerState(MASS * 9.0, 0.4, truth, memory(), ZERO)
+    # begun so that the estimate, which moves, is right in the middle
+    back = evaluate(state, eight(times[0]), begin, p, False, 0.0).b_hat_rate
+    begin = begin._replace(b_hat=sub(truth, (h * back[0], h * back[1], h * back[2])))
+    flight = fly(eight, state, begin, p, world, times, tolerance=1e-13)
+    middle = flight[1]
+    samples = []
+    monkeypatch.setattr(law, "heading_torque", listen)
+    for t, sample in zip(times, flight, strict=True):
+        samples.append(evaluate(sample.state, eight(t), sample.controller, p, False, 0.0))
+    before, now, after = told
+    for given_rate, a, b in ((now[1], before[0], after[0]), (now[2], before[1], after[1])):
+        assert np.array(given_rate) == pytest.approx((np.array(b) - np.array(a)) / (2 * h), rel=1e-3, abs=1e-4)
+    e1_rate = sub(middle.state.v, eight(times[1]).v)
+    rates = law.error_rates(samples[1].errors, e1_rate, samples[1].b_hat_rate, p.gains, drag)
+    for k, rate in enumerate(rates, 1):
+        change = np.array(samples[2].errors[k]) - np.array(samples[0].errors[k])
+        assert np.array(rate) == pytest.approx(change / (2 * h), rel=1e-3, abs=1e-4)
 
 
 def b_hat_at(sample):
