@@ -265,9 +265,11 @@ def test_what_it_says_has_the_figure_the_limit_and_how_long_it_lasted() -> None:
     assert finding is not None
     limit = f"limit {limits.position_error_abort_m:.3g} (limits.position_error_abort_m)"
     assert finding.detail == f"123 m, {limit}"
-    slow = [guards.slowly(Slow(state_rate_hz=100.0), 0.1 * i) for i in range(7)]
-    told = [finding.detail for finding in slow if finding is not None]
-    assert told == [f"100 Hz, limit {limits.state_rate_min * 250:.3g} (limits.state_rate_min) for 0.5 s"]
+    least = f"limit {limits.state_rate_min * 250:.3g} (limits.state_rate_min)"
+    for rate_hz, told in ((100.0, "100 Hz"), (0.0, "0 Hz")):
+        guards = Guards(VEHICLE, PARAMETERS)
+        slow = [guards.slowly(Slow(state_rate_hz=rate_hz), 0.1 * i) for i in range(7)]
+        assert [finding.detail for finding in slow if finding is not None] == [f"{told}, {least} for 0.5 s"]
 
 
 def test_of_two_guards_that_ask_for_the_same_the_first_is_named() -> None:
