@@ -40,6 +40,15 @@ def eight(t: float, rate: float = 0.2) -> Reference:
     )
 
 
+def rising(t: float) -> Reference:
+    """The same, up and down as well: nothing of it is zero."""
+    flat, n = eight(t), 0.3
+    c, s = math.cos(n * t + 0.4), math.sin(n * t + 0.4)
+    waves = (1.2 * s, 1.2 * n * c, -1.2 * n**2 * s, -1.2 * n**3 * c, 1.2 * n**4 * s)
+    lifted = ((x, y, z + wave) for (x, y, z), wave in zip(flat[:5], waves, strict=True))
+    return Reference(*lifted, *flat[5:])
+
+
 def numbers(low: float, high: float):
     return st.floats(low, high, allow_nan=False, allow_infinity=False)
 

@@ -6,7 +6,14 @@ from law_cases import MASS, NO_LIMITS, PAPER_GAINS, ZERO, memory, parameters
 
 from companion.campaign.ideal import World, fly
 from companion.config import load_flight, load_vehicle
-from companion.control.certificate import certify, disturbance_overcome, inside_matrix, linear_loop, thrust_bounds
+from companion.control.certificate import (
+    certify,
+    disturbance_overcome,
+    inside_matrix,
+    linear_loop,
+    outside_matrix,
+    thrust_bounds,
+)
 from companion.control.law import ControllerState, Model, Parameters
 from companion.control.sampled import Timing, loop_matrix, margins, spectral_radius
 from companion.control.types import State
@@ -48,11 +55,22 @@ def test_q_is_the_derivative_of_v_along_the_linear_loop():
     assert derivative[:4, 4] == pytest.approx(np.zeros(4), abs=1e-12)
 
 
+@pytest.mark.parametrize("drag", [0.0, 0.7])
+def test_both_matrices_are_symmetric_as_eigenvalues_of_one_half_of_them_want_it(drag):
+    for matrix in (inside_matrix(PAPER_GAINS, drag), outside_matrix(PAPER_GAINS, drag)):
+        assert (matrix == matrix.T).all()
+
+
 def test_thrust_bounds_are_symmetric_about_the_weight_and_grow_with_the_start():
     near = thrust_bounds(PAPER_GAINS, MASS, 9.81, 0.3, 1.2, 0.01, 0.0)
     far = thrust_bounds(PAPER_GAINS, MASS, 9.81, 0.3, 1.2, 10.0, 0.0)
     assert near.low_n + near.high_n == pytest.approx(2 * MASS * 9.81)
     assert far.low_n < near.low_n
+    g, v = PAPER_GAINS, 0.01 + 1.2**2 / (2 * 0.7 * 2.0)
+    assert (g.k1, g.k2, g.gamma) == (0.7, 4.0, 2.0)
+    assert near.high_n == pytest.approx(
+        MASS * (9.81 + 0.3 + 1.2 + np.sqrt((2 * 0.7 * 2.0 + (2 * 0.7**2 * 4.0) ** 2) * v))
+    )
     nothing = thrust_bounds(PAPER_GAINS._replace(gamma=0.0), MASS, 9.81, 0.3, 1.2, 0.0, 0.0)
     assert nothing == (-np.inf, np.inf)
 

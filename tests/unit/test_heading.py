@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from law_cases import MASS, PAPER_GAINS, ZERO, eight, memory, numbers, parameters, vectors
+from law_cases import MASS, PAPER_GAINS, ZERO, eight, memory, numbers, parameters, quaternions, vectors
 
 from companion.campaign.ideal import World, fly
 from companion.control import heading
-from companion.control.heading import COMMANDED, DAMPING, SIDESLIP, HeadingState, desired_frame, unit_rate
+from companion.control.heading import (
+    COMMANDED,
+    DAMPING,
+    SIDESLIP,
+    Frame,
+    HeadingState,
+    desired_frame,
+    limit_rate,
+    unit_rate,
+)
 from companion.control.law import ControllerState
 from companion.control.types import Reference, State
 from companion.control.vectors import axes, cross, dot, norm, quat_exp
@@ -96,6 +105,32 @@ def test_damping_and_missing_thrust_direction_only_damp():
     weak = ((0.0, 0.0, 0.1), ZERO, ZERO)
     tau3, after, _ = torque(level(0.3, 0.5), moving((1.0, 0.0, 0.0)), weak, memory(), SIDESLIP, GAINS, (1.0, 0.1), 0.01)
     assert tau3 == -1.0 and after == memory()
+
+
+def test_a_nose_along_the_thrust_has_no_direction_and_is_only_damped():
+    along = ((9.81, 0.0, 0.0), ZERO, ZERO)
+    ref = Reference(ZERO, ZERO, ZERO, ZERO, ZERO, 0.0, 0.3, 0.0)
+    tau3, _, error = torque(level(0.3, 0.5), ref, along, memory(), COMMANDED, GAINS, (1.0, 0.1), 0.01)
+    assert tau3 == -1.0 and math.isnan(error)
+
+
+@given(q=quaternions, turn=numbers(-3.0, 3.0), off=numbers(-0.3, 0.3), dt=st.sampled_from([0.02, 0.4, 2.0]))
+def test_the_rate_limit_holds_about_any_axis(q, turn, off, dt):
+    """The last direction need not be at right angles to the thrust any more: its share in the plane counts."""
+    rate, (r1, r2, r3) = 0.5, np.array(axes(q))
+    wanted = math.cos(turn) * r2 - math.sin(turn) * r1
+    frame = Frame(tuple(np.cross(wanted, r3)), tuple(wanted), ZERO, 9.0, 9.0)
+    last = (r2 + off * r3) / math.hypot(1.0, off)
+    out = limit_rate(frame, tuple(r3), tuple(last), rate, dt)
+    if abs(abs(turn) - rate * dt) < 1e-6:
+        return
+    if abs(turn) < rate * dt:
+        assert out == frame
+        return
+    turned = math.copysign(rate * dt, turn)
+    assert np.array(out.r2d) == pytest.approx(math.cos(turned) * r2 - math.sin(turned) * r1, abs=1e-9)
+    assert np.array(out.r1d) == pytest.approx(np.cross(out.r2d, r3), abs=1e-9)
+    assert (out.w3d, out.w3d_rate) == (math.copysign(rate, turn), 0.0)
 
 
 def test_slow_path_holds_the_last_direction_with_hysteresis():

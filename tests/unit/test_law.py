@@ -6,7 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from law_cases import MASS, NO_LIMITS, PAPER_GAINS, ZERO, eight, far_states, memory, near_states, parameters, vectors
+from law_cases import (
+    MASS,
+    NO_LIMITS,
+    PAPER_GAINS,
+    ZERO,
+    eight,
+    far_states,
+    memory,
+    near_states,
+    parameters,
+    rising,
+    vectors,
+)
 from scipy.linalg import expm
 
 from companion.campaign.ideal import World, fly
@@ -35,7 +47,7 @@ def test_inside_the_errors_follow_the_linear_system(kind, drag, gamma):
     truth = np.array([force[0] / MASS, force[1] / MASS, force[2] / MASS + 0.2])
     times = np.linspace(0.0, 6.0, 61)
     ctrl = ControllerState(MASS * G * 1.02, 0.4, (0.1, 0.2, -0.1), memory(), ZERO)
-    flight = fly(eight, start, ctrl, p, world, times, tolerance=1e-11)
+    flight = fly(rising, start, ctrl, p, world, times, tolerance=1e-11)
     assert max(norm(s.evaluation.errors.e1) for s in flight) < p.gains.p_max
 
     a = linear_loop(p.gains, drag)
@@ -110,18 +122,18 @@ def test_what_the_heading_is_told_of_the_force_is_a_direction_and_its_two_deriva
     times = 3.0 + h * np.arange(3)
     begin = ControllerState(MASS * 9.0, 0.4, truth, memory(), ZERO)
     # begun so that the estimate, which moves, is right in the middle
-    back = evaluate(state, eight(times[0]), begin, p, False, 0.0).b_hat_rate
+    back = evaluate(state, rising(times[0]), begin, p, False, 0.0).b_hat_rate
     begin = begin._replace(b_hat=sub(truth, (h * back[0], h * back[1], h * back[2])))
-    flight = fly(eight, state, begin, p, world, times, tolerance=1e-13)
+    flight = fly(rising, state, begin, p, world, times, tolerance=1e-13)
     middle = flight[1]
     samples = []
     monkeypatch.setattr(law, "heading_torque", listen)
     for t, sample in zip(times, flight, strict=True):
-        samples.append(evaluate(sample.state, eight(t), sample.controller, p, False, 0.0))
+        samples.append(evaluate(sample.state, rising(t), sample.controller, p, False, 0.0))
     before, now, after = told
     for given_rate, a, b in ((now[1], before[0], after[0]), (now[2], before[1], after[1])):
         assert np.array(given_rate) == pytest.approx((np.array(b) - np.array(a)) / (2 * h), rel=1e-3, abs=1e-4)
-    e1_rate = sub(middle.state.v, eight(times[1]).v)
+    e1_rate = sub(middle.state.v, rising(times[1]).v)
     rates = law.error_rates(samples[1].errors, e1_rate, samples[1].b_hat_rate, p.gains, drag)
     for k, rate in enumerate(rates, 1):
         change = np.array(samples[2].errors[k]) - np.array(samples[0].errors[k])
@@ -261,6 +273,31 @@ def test_rate_limit_keeps_the_direction_of_roll_and_pitch():
     assert cut.limits & law.LIMIT_ROLL_PITCH_RATE
 
 
+@pytest.mark.parametrize(("roll", "pitch"), [(0.2, 0.1), (0.1, 0.2), (9.0, 0.1), (0.1, 9.0)])
+def test_roll_and_pitch_have_limits_of_their_own(roll, pitch):
+    state, ctrl = level_state(p=(3.0, 1.0, 0.0)), ControllerState(MASS * G, 0.0, ZERO, memory(), ZERO)
+    free = step(state, HOVER, ctrl, parameters(), False, 0.1)[0].rates
+    cut = step(state, HOVER, ctrl, parameters(limits=NO_LIMITS._replace(rate_max=(roll, pitch, 9.0))), False, 0.1)[0]
+    over = max(abs(free[0]) / roll, abs(free[1]) / pitch, 1.0)
+    assert cut.rates == pytest.approx((free[0] / over, free[1] / over, free[2]))
+    assert bool(cut.limits & law.LIMIT_ROLL_PITCH_RATE) == (over > 1.0)
+
+
+def test_what_the_autopilots_integral_will_add_is_taken_out_and_forgotten_slowly():
+    """Section 8: w_sent = w_cmd - k_i L, L' = w_cmd - w - (k_i + 0.2) L, axis by axis."""
+    p, dt = parameters(), 0.01
+    k, memory_of_leads, w = np.array([1.3, 0.9, 0.4]), np.array([0.3, -0.2, 0.1]), (0.2, -0.1, 0.3)
+    p = p._replace(model=p.model._replace(rate_integral=tuple(k)))
+    state = level_state(p=(0.4, -0.3, 0.2))._replace(w=w)
+    command, after, _ = step(
+        state, HOVER, ControllerState(MASS * G, 0.0, ZERO, memory(), tuple(memory_of_leads)), p, False, dt
+    )
+    wanted = np.array(command.rates_model)
+    assert np.array(command.rates) == pytest.approx(wanted - k * memory_of_leads)
+    change = (np.array(after.lead_integral) - memory_of_leads) / dt
+    assert change == pytest.approx(wanted - np.array(w) - (k + 0.2) * memory_of_leads)
+
+
 @given(lag=st.floats(0.005, 0.2), dt=st.floats(0.001, 0.05), w=st.floats(-3, 3), tau=st.floats(-50, 50))
 def test_the_rate_setpoint_inverts_a_first_order_loop(lag, dt, w, tau):
     target = law.rate_setpoint(w, tau, lag, dt)
@@ -283,6 +320,22 @@ def test_projection_never_adds_to_the_lyapunov_function(b, y):
         assert dot(sub(truth, b), sub(free, rate)) <= 1e-9
     if size > 0.999 * bound:
         assert dot(b, rate) <= 0.05 * norm(free) * bound
+
+
+@given(b=vectors(1.9), y=vectors(3.0))
+def test_the_projection_takes_away_a_share_of_what_points_outwards_and_nothing_else(b, y):
+    bound, b = 2.0, np.array(b)
+    inner = (1.0 - law.PROJECTION_LAYER) * bound
+    e2, e3, e4 = y, tuple(0.5 * x for x in y), tuple(-0.25 * x for x in y)
+    free = 1.5 * (np.array(e2) + np.array(e3) + np.array(e4))
+    rate = np.array(law.estimator_rate(law.Errors(ZERO, e2, e3, e4, ZERO), tuple(b), 1.5, bound))
+    size_sq, outward = b @ b, b @ free
+    if size_sq <= inner**2 or outward <= 0.0:
+        assert rate == pytest.approx(free)
+        return
+    share = min(1.0, (size_sq - inner**2) / (bound**2 - inner**2))
+    assert b @ rate == pytest.approx((1.0 - share) * outward, abs=1e-9)
+    assert np.cross(b, rate) == pytest.approx(np.cross(b, free), abs=1e-9)
 
 
 def test_start_from_a_tilted_hover_does_not_step():
