@@ -1,7 +1,17 @@
-"""Paths that the tests share."""
+"""Paths that the tests share, and what is left out where numba is not there or hidden."""
 
 import sys
 from pathlib import Path
 
+import pytest
+
+from companion import accelerate
+
 sys.path.insert(0, str(Path(__file__).parent / "unit"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """What is marked needs numba, also where only COMPANION_TEST_WITHOUT_NUMBA=1 hides it."""
+    if item.get_closest_marker("numba") is not None and not accelerate.available():
+        pytest.skip("numba is not installed")

@@ -153,6 +153,12 @@ class Processes:
         self._end()
 
 
+def check_scheduler(where: str) -> None:
+    """Raises InputError when this names no scheduler; nothing is asked of it."""
+    if where != "local" and "://" not in where:
+        raise InputError(f'--scheduler {where!r}: must be "local" or an address such as tcp://127.0.0.1:8786')
+
+
 class Dask:
     """On a Dask cluster.
 
@@ -170,8 +176,7 @@ class Dask:
             distributed: Any = importlib.import_module("distributed")
         except ImportError:
             raise InputError("--scheduler needs dask.distributed: pip install 'offboard-companion[campaign]'") from None
-        if where != "local" and "://" not in where:
-            raise InputError(f'--scheduler {where!r}: must be "local" or an address such as tcp://127.0.0.1:8786')
+        check_scheduler(where)
         self._cluster: Any = None
         address = where
         if where == "local":

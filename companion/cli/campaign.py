@@ -62,9 +62,12 @@ def run(
     if scheduler is not None and scheduler != "local" and workers is not None:
         raise InputError("--workers is for this machine; a cluster has the workers that it has")
     from companion import accelerate
+    from companion.campaign.engines import check_scheduler
     from companion.campaign.store import require_pyarrow
     from companion.campaign.study import load_study
 
+    if scheduler is not None:
+        check_scheduler(scheduler)
     require_pyarrow()
     chosen = accelerate.resolve(engine)
     changes = {key: value for key, value in (("count", count), ("seed", seed)) if value is not None}

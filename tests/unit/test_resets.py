@@ -76,12 +76,10 @@ def test_small_jumps_move_the_reference_and_large_ones_do_not() -> None:
     assert Reset.from_numbers(resets.carried[0]._asdict()) == resets.carried[0]
 
 
-@pytest.mark.parametrize("engine", ["python", "numba"])
+@pytest.mark.parametrize("engine", ["python", pytest.param("numba", marks=pytest.mark.numba)])
 @pytest.mark.parametrize(("moved", "turn"), [((0.5, -0.2, 0.1), 0.0), (ZERO, 0.3), ((0.5, 0.0, 0.0), -0.2)])
 def test_the_command_after_a_carried_reset_is_the_one_without(engine: str, moved, turn: float) -> None:
     """At rest in wind, heading held: the estimate jumps, thrust and roll and pitch rates do not."""
-    if engine == "numba":
-        pytest.importorskip("numba")
 
     def commands(reset: bool) -> list[tuple[float, ...]]:
         vehicle = load_vehicle("bundled")
@@ -183,10 +181,8 @@ def test_the_tracker_uses_only_attitudes_that_are_newer_than_the_state() -> None
     assert command(0.99) == (0, pytest.approx(ZERO, abs=1e-9))
 
 
-@pytest.mark.parametrize("engine", ["python", "numba"])
+@pytest.mark.parametrize("engine", ["python", pytest.param("numba", marks=pytest.mark.numba)])
 def test_another_delay_is_predicted_over_from_the_next_state_on(engine: str) -> None:
-    if engine == "numba":
-        pytest.importorskip("numba")
     tracker = Tracker(load_vehicle("bundled"), "rates", kernels(engine))
     state = State((0.0, 0.0, -10.0), ZERO, (1.0, 0.0, 0.0, 0.0), ZERO)
     tracker.begin(state)

@@ -321,7 +321,6 @@ def test_controls_are_rotor_commands() -> None:
 
 @pytest.mark.numba
 def test_both_engines_give_the_same_samples() -> None:
-    pytest.importorskip("numba")
     one = world_after(0.5, (0.6, 0.61, 0.62, 0.63), world=World(wind_m_s=(5.0, 0.0, 0.0), turbulence=0.2))
     two = world_after(
         0.5, (0.6, 0.61, 0.62, 0.63), world=World(wind_m_s=(5.0, 0.0, 0.0), turbulence=0.2), engine="numba"

@@ -69,8 +69,6 @@ def test_weak_rotors_are_found_without_a_step_and_b_hat_is_left_with_nothing(mon
 @pytest.mark.parametrize("engine", ["python", pytest.param("numba", marks=pytest.mark.numba)])
 def test_the_command_does_not_step_with_the_scale(engine: str) -> None:
     """The same states twice, tilted and turning; in one flight the scale changes by half a percent between two."""
-    if engine == "numba":
-        pytest.importorskip("numba")
     vehicle = load_vehicle("bundled", {"controller": {"thrust_scale_estimate": True, "heading": "commanded"}})
     sent: dict[float, list[tuple[float, ...]]] = {}
     for ratio in (1.0, 1.005):
