@@ -73,8 +73,7 @@ def take_core_of_two(port: int) -> None:
     with contextlib.suppress(OSError, AttributeError):  # not permitted; not Linux
         cores = sorted(os.sched_getaffinity(0))
         if len(cores) == 2:
-            os.sched_setaffinity(0, {cores[port % 2]})
-            os.environ[CORES_VARIABLE] = ",".join(map(str, cores))
+            _stay_on(cores[port % 2], cores)
 
 
 def prepare() -> list[Measure]:
@@ -141,9 +140,14 @@ def _stay_on_a_core() -> str:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         raise _NotPermittedError("there is one core only, nothing to choose")
-    os.sched_setaffinity(0, {cores[-1]})  # interrupts are mostly served by the first
-    os.environ[CORES_VARIABLE] = ",".join(map(str, cores))
+    _stay_on(cores[-1], cores)  # interrupts are mostly served by the first
     return f"stays on {cores[-1]} of {len(cores)}"
+
+
+def _stay_on(core: int, cores: list[int]) -> None:
+    """Keeps the calling thread on one of the cores that it has; `rejoin` knows them all."""
+    os.sched_setaffinity(0, {core})
+    os.environ[CORES_VARIABLE] = ",".join(map(str, cores))
 
 
 def _libc() -> ctypes.CDLL:

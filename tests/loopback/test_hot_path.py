@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from companion import accelerate
-
 HERE = Path(__file__).parent
 FLY = """
 import gc, json, sys, tracemalloc
@@ -80,7 +78,7 @@ print(json.dumps(result))
 """
 ENGINES = [
     "python",
-    pytest.param("numba", marks=pytest.mark.skipif(not accelerate.available(), reason="numba is not installed")),
+    pytest.param("numba", marks=pytest.mark.numba),
 ]
 
 

@@ -8,7 +8,6 @@ import pytest
 from flight_cases import INDOOR, Stand, make_flight
 from typer.testing import CliRunner
 
-from companion import accelerate
 from companion.campaign.replay import replay
 from companion.cli import app
 from companion.errors import InputError
@@ -40,7 +39,7 @@ def test_nothing_changed_nothing_differs(folder):
     assert shares == sorted(shares)
 
 
-@pytest.mark.skipif(not accelerate.available(), reason="numba is not installed")
+@pytest.mark.numba
 def test_compiled_commands_agree_with_the_recorded_ones(folder):
     for found in replay(folder, kernels("numba")).differences:
         assert found.largest < 1e-9

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from companion import accelerate
 from companion.campaign import kernel
 from companion.campaign.outcome import BINS, measured
 from companion.campaign.simulate import fly_sampled
@@ -18,8 +17,6 @@ from companion.flight.tracker import kernels
 from companion.trajectory.load import load, of_flight
 from sim_link.wind import DRAWS_PER_PERIOD, Wind, series
 from tests.unit.campaign_cases import tiny
-
-needs_numba = pytest.mark.skipif(not accelerate.available(), reason="numba is not there")
 
 
 def flight_of(name="eight", kind="rates", wind=True, **link):
@@ -60,7 +57,7 @@ def test_the_kernel_flies_what_the_flight_step_by_step_flies(name, kind, link):
     assert whole.disturbance_m_s2 != (0.0, 0.0, 0.0)
 
 
-@needs_numba
+@pytest.mark.numba
 @pytest.mark.parametrize("kind", ["rates", "attitude"])
 def test_both_engines_give_the_same_numbers(kind):
     case = case_of(flight_of("eight", kind))

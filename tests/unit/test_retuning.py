@@ -8,7 +8,6 @@ from dataclasses import asdict
 
 import pytest
 
-from companion import accelerate
 from companion.campaign import simulate
 from companion.config import Acceptance, build_flight, load_vehicle
 from companion.control import flat
@@ -22,7 +21,6 @@ from companion.flight.retuning import POINTS, ParameterChange, Retuning, Transit
 from companion.flight.tracker import Tracker, kernels
 from companion.trajectory.load import load, of_flight
 
-needs_numba = pytest.mark.skipif(not accelerate.available(), reason="numba is not installed")
 ZERO = (0.0, 0.0, 0.0)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 STIFFER = {"k1_1_s": 2.2, "k2": 3.2, "k3_1_s": 3.5, "gamma_1_s3": 5.0, "position_error_max_m": 0.9}
@@ -75,7 +73,7 @@ def test_a_settled_tracker_gives_the_numbers_of_a_fresh_one_in_the_same_state():
     assert hover(tracker, 20, 20, state=state) == hover(fresh, 20, 20, state=state)
 
 
-@needs_numba
+@pytest.mark.numba
 @pytest.mark.parametrize("kinds", [("sideslip", "commanded"), ("damping", "sideslip"), ("commanded", "damping")])
 def test_both_engines_stay_equal_all_the_way(kinds):
     vehicle = load_vehicle("bundled", {"controller": {"heading": kinds[0]}})

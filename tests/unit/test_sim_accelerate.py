@@ -14,8 +14,6 @@ from sim_link import accelerate
 from sim_link.accelerate import available, choose, compile_kernel
 from sim_link.rotation import cross, exponential
 
-needs_numba = pytest.mark.skipif(not available(), reason="numba is not available")
-
 HELPER = """
 FACTOR = {factor}
 
@@ -67,7 +65,6 @@ def source(folder: Path, *, factor: float, more: str = "") -> Callable[..., Any]
 
 
 @pytest.mark.numba
-@needs_numba
 def test_cache_survives_and_follows_every_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import numba
 
@@ -91,7 +88,6 @@ def test_cache_survives_and_follows_every_source(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.numba
-@needs_numba
 def test_compiles_without_a_place_to_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import numba
 
@@ -103,7 +99,6 @@ def test_compiles_without_a_place_to_cache(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.numba
-@needs_numba
 def test_twins_are_made_once_and_agree() -> None:
     assert compile_kernel(exponential) is compile_kernel(exponential)
     for a in ((0.3, -1.0, 2.0), (1e-6, 0.0, 0.0)):
@@ -111,7 +106,6 @@ def test_twins_are_made_once_and_agree() -> None:
 
 
 @pytest.mark.numba
-@needs_numba
 def test_what_cannot_be_a_kernel_is_refused() -> None:
     factor = 2.0
 

@@ -7,7 +7,6 @@ import math
 import pytest
 from sim_cases import HOVER, LEVEL, NOTHING, PAPER, noiseless, rates, uneven, vehicle
 
-from sim_link.accelerate import available
 from sim_link.airframe import START_US, Airframe, Truth
 from sim_link.inner_loops import ATTITUDE, STOPPED_SETPOINT, TORQUE, Setpoint
 from sim_link.rotation import body_z, exponential, yaw_of
@@ -145,7 +144,6 @@ def test_hardest_touchdown_is_kept() -> None:
 
 
 @pytest.mark.numba
-@pytest.mark.skipif(not available(), reason="numba is not available")
 def test_both_engines_give_the_same_numbers() -> None:
     for px4 in ("1.18", "1.13"):
         plain = varied_flight(airframe(DRAGGY, WINDY, engine="python", px4=px4))

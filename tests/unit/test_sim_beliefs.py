@@ -10,7 +10,6 @@ import pytest
 from sim_cases import LEVEL, NOTHING, noiseless, rates, vehicle
 
 from sim_link import engines
-from sim_link.accelerate import available
 from sim_link.airframe import START_US, Airframe
 from sim_link.autopilot import Autopilot, Result
 from sim_link.beliefs import STAMP_BACK_US, Beliefs
@@ -311,7 +310,6 @@ def test_the_array_engine_gives_the_same_beliefs_to_the_bit(monkeypatch: pytest.
 
 
 @pytest.mark.numba
-@pytest.mark.skipif(not available(), reason="numba is not available")
 def test_the_compiled_engine_gives_the_same_beliefs() -> None:
     craft = vehicle(**WALKING)
     plain, compiled = (everything(airframe(craft, engine), 5, False) for engine in ("python", "numba"))

@@ -9,7 +9,6 @@ import pytest
 from sim_cases import LEVEL, NOTHING, rates, vehicle
 
 from sim_link import engines, flat
-from sim_link.accelerate import available
 from sim_link.airframe import Airframe
 from sim_link.engines import CompiledEngine, PlainEngine
 from sim_link.estimator import NOISE_ROWS, Noise
@@ -67,7 +66,6 @@ def test_flat_kernels_in_plain_python_are_the_plain_engine_to_the_bit(monkeypatc
 
 
 @pytest.mark.numba
-@pytest.mark.skipif(not available(), reason="numba is not available")
 def test_compiled_engine_gives_the_same_numbers_beliefs_included() -> None:
     plain, compiled = flattened(fly(airframe())), flattened(fly(airframe("numba")))
     assert compiled == pytest.approx(plain, rel=1e-12, abs=1e-12, nan_ok=True)

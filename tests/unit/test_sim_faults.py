@@ -13,7 +13,6 @@ import pytest
 from sim_cases import noiseless
 
 from sim_link import codec, fault_cli, fault_file
-from sim_link.accelerate import available
 from sim_link.autopilot import Result
 from sim_link.codec import Encoder, frames, mavlink
 from sim_link.fault_keys import FaultError
@@ -293,7 +292,6 @@ def truth(vehicle: Vehicle) -> list[float]:
 
 
 @pytest.mark.numba
-@pytest.mark.skipif(not available(), reason="numba is not available")
 def test_both_engines_fly_the_same_under_faults() -> None:
     faults = (
         fault("rotor", 0.2, 0.6, rotor=1, share=0.8),

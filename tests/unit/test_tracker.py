@@ -4,7 +4,6 @@ import random
 
 import pytest
 
-from companion import accelerate
 from companion.config import load_flight, load_vehicle
 from companion.control import flat
 from companion.control.types import State
@@ -12,8 +11,6 @@ from companion.control.vectors import quat_normalise
 from companion.flight.course import Course, at_rest
 from companion.flight.tracker import Tracker, kernels
 from companion.trajectory.load import load
-
-needs_numba = pytest.mark.skipif(not accelerate.available(), reason="numba is not installed")
 
 
 def random_state(rng: random.Random, near: float) -> State:
@@ -25,7 +22,7 @@ def random_state(rng: random.Random, near: float) -> State:
     return State((x, y, z - 10.0), vec(3.0), q, vec(1.0))
 
 
-@needs_numba
+@pytest.mark.numba
 @pytest.mark.parametrize("output", ["rates", "attitude", "actuators"])
 @pytest.mark.parametrize("heading", ["damping", "sideslip", "commanded"])
 def test_both_engines_give_the_same_numbers(output, heading):
