@@ -185,14 +185,19 @@ def survives(module: str, index: int) -> bool:
 
 
 def _in_child(module: str, index: int) -> None:
+    import hypothesis
     import pytest
 
+    # a failure is enough: to find the smallest input that fails, and to draw where it did, takes most of the time
+    phases = [hypothesis.Phase.explicit, hypothesis.Phase.generate]
+    hypothesis.settings.register_profile("mutation", hypothesis.settings.default, phases=phases, database=None)
+    hypothesis.settings.load_profile("mutation")
     code = 1
     try:
         if index >= 0:
             sys.meta_path.insert(0, _Overlay(module, changed(module, index)))
         tests = [str(ROOT / "tests" / "unit" / name) for name in TESTS[module]]
-        options = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "-m", "not long", "--hypothesis-seed=0"]
+        options = ["-q", "-x", "-p", "no:cacheprovider", "--tb=no", "-m", "not long", "--hypothesis-seed=0"]
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             code = int(pytest.main([*tests, *options]))
     finally:
