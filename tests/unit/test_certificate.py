@@ -12,6 +12,7 @@ from companion.control.certificate import (
     inside_matrix,
     linear_loop,
     outside_matrix,
+    poles,
     thrust_bounds,
 )
 from companion.control.law import ControllerState, Model, Parameters
@@ -71,6 +72,8 @@ def test_thrust_bounds_are_symmetric_about_the_weight_and_grow_with_the_start():
     assert near.high_n == pytest.approx(
         MASS * (9.81 + 0.3 + 1.2 + np.sqrt((2 * 0.7 * 2.0 + (2 * 0.7**2 * 4.0) ** 2) * v))
     )
+    known = thrust_bounds(PAPER_GAINS, MASS, 9.81, 0.3, 1.0, 0.01, 0.2)  # of the same ball, a part known at the start
+    assert known.high_n == pytest.approx(near.high_n - MASS * 0.2)
     nothing = thrust_bounds(PAPER_GAINS._replace(gamma=0.0), MASS, 9.81, 0.3, 1.2, 0.0, 0.0)
     assert nothing == (-np.inf, np.inf)
 
@@ -86,6 +89,13 @@ def test_without_the_estimator_only_so_much_disturbance_is_overcome(share, drift
     flight = fly(lambda t: hover, start, ctrl, parameters(gains), world, np.array([0.0, 30.0, 60.0]))
     speed = abs(flight[-1].state.v[0])
     assert (speed > 0.01) == drifts
+
+
+def test_without_the_estimator_its_pole_is_gone_and_the_others_stay():
+    """A hardly working estimator has a pole close to zero; the four others are those of the errors alone."""
+    slowest, *others = poles(PAPER_GAINS._replace(gamma=1e-7), 0.3)
+    assert abs(slowest) < 1e-5
+    assert poles(PAPER_GAINS._replace(gamma=0.0), 0.3) == [pytest.approx(pole, abs=1e-5) for pole in others]
 
 
 def test_fast_sampling_without_lags_gives_the_poles_of_the_continuous_loop():

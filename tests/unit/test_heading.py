@@ -1,5 +1,6 @@
 """The free heading: w3d and w3d' against finite differences, the holds, the rate limit."""
 
+import itertools
 import math
 
 import numpy as np
@@ -17,7 +18,9 @@ from companion.control.heading import (
     Frame,
     HeadingState,
     desired_frame,
+    forward_direction,
     limit_rate,
+    unit_derivatives,
     unit_rate,
 )
 from companion.control.law import ControllerState
@@ -54,6 +57,58 @@ def test_yaw_rate_and_its_derivative_agree_with_finite_differences(force, forwar
     assert np.array(now.r2d_rate) == pytest.approx(r2_rate, abs=1e-6 * scale)
     assert now.w3d == pytest.approx(-np.dot(now.r1d, r2_rate), abs=1e-6 * scale)
     assert now.w3d_rate == pytest.approx((after.w3d - before.w3d) / (2 * h), abs=1e-5 * scale)
+
+
+@given(vector=st.tuples(vectors(2.0), vectors(1.0), vectors(1.0)))
+def test_the_derivatives_of_a_direction_agree_with_finite_differences(vector):
+    def direction(t):
+        return unit_derivatives(*smooth(vector, t))
+
+    if norm(vector[0]) < 0.5:
+        return
+    h = 1e-5
+    before, now, after = direction(-h), direction(0.0), direction(h)
+    for order in (0, 1):
+        rate = (np.array(after[order]) - np.array(before[order])) / (2 * h)
+        assert np.array(now[order + 1]) == pytest.approx(rate, abs=1e-5 * (1.0 + np.abs(now[2]).max()))
+    assert np.array(unit_rate(*smooth(vector, 0.0)[:2])) == pytest.approx(np.array(now[:2]))
+
+
+@given(q=quaternions, v=vectors(2.0), a=vectors(1.0), j=vectors(1.0), held=st.booleans())
+def test_the_path_gives_the_direction_where_it_is_fast_enough_across_the_thrust(q, v, a, j, held):
+    """Otherwise the last one is held, which does not turn."""
+    _, r2, r3 = axes(q)
+    ref, slow, last = Reference(ZERO, v, a, j, ZERO, 0.0, 0.0, 0.0), 0.4, (0.6, 0.0, 0.8)
+    f, f1, f2, after, size = forward_direction(ref, r3, HeadingState(r2, last, held), SIDESLIP, slow)
+    across = float(np.linalg.norm(np.cross(r3, v)))
+    if across > (2.0 * slow if held else slow):
+        assert (f, f1, f2) == (v, a, j)
+        assert after == HeadingState(r2, last, False)
+        assert size == pytest.approx(across)
+        return
+    assert (f1, f2) == (ZERO, ZERO)
+    assert after == HeadingState(r2, f, True)
+    assert f == pytest.approx(last if held else tuple(np.cross(r2, r3)))
+    assert size == pytest.approx(np.linalg.norm(np.cross(r3, f)))
+
+
+@given(q=quaternions, yaw=numbers(-3.0, 3.0), rate=numbers(-1.0, 1.0), acceleration=numbers(-1.0, 1.0))
+def test_a_commanded_direction_is_level_and_turns_with_the_commanded_rate(q, yaw, rate, acceleration):
+    _, r2, r3 = axes(q)
+
+    def direction(t):
+        now = (yaw + rate * t + acceleration * t * t / 2, rate + acceleration * t, acceleration)
+        return forward_direction(Reference(ZERO, ZERO, ZERO, ZERO, ZERO, *now), r3, memory(), COMMANDED, 0.1)
+
+    h = 1e-4
+    before, (f, f1, f2, after, size), later = direction(-h), direction(0.0), direction(h)
+    assert f == (math.cos(yaw), math.sin(yaw), 0.0)
+    assert np.array(f1) == pytest.approx((np.array(later[0]) - np.array(before[0])) / (2 * h), abs=1e-6)
+    assert np.array(f2) == pytest.approx((np.array(later[1]) - np.array(before[1])) / (2 * h), abs=1e-6)
+    assert size == pytest.approx(np.linalg.norm(np.cross(r3, f)))
+    held = HeadingState(r2, f, True)
+    assert forward_direction(Reference(*[ZERO] * 5, yaw, 0.0, 0.0), r3, held, COMMANDED, 0.1)[3] == (r2, f, False)
+    assert after == memory()
 
 
 def torque(state, *arguments):
@@ -107,6 +162,15 @@ def test_damping_and_missing_thrust_direction_only_damp():
     assert tau3 == -1.0 and after == memory()
 
 
+@pytest.mark.parametrize(("size", "damped"), [(0.45, True), (0.55, False)])
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.1), (1.0, 0.0, 0.1), (0.0, 0.6, 0.8)])
+def test_half_a_metre_per_second_squared_of_force_has_a_direction(direction, size, damped):
+    force = (tuple(size * x / norm(direction) for x in direction), ZERO, ZERO)
+    ref = moving((1.0, 1.0, 0.0))
+    tau3, after, error = torque(level(0.3, 0.5), ref, force, memory(), SIDESLIP, GAINS, (9.0, 0.1), 0.01)
+    assert (tau3 == -1.0, after == memory(), math.isnan(error)) == (damped,) * 3
+
+
 def test_a_nose_along_the_thrust_has_no_direction_and_is_only_damped():
     along = ((9.81, 0.0, 0.0), ZERO, ZERO)
     ref = Reference(ZERO, ZERO, ZERO, ZERO, ZERO, 0.0, 0.3, 0.0)
@@ -131,6 +195,34 @@ def test_the_rate_limit_holds_about_any_axis(q, turn, off, dt):
     assert np.array(out.r2d) == pytest.approx(math.cos(turned) * r2 - math.sin(turned) * r1, abs=1e-9)
     assert np.array(out.r1d) == pytest.approx(np.cross(out.r2d, r3), abs=1e-9)
     assert (out.w3d, out.w3d_rate) == (math.copysign(rate, turn), 0.0)
+
+
+@pytest.mark.parametrize("share", [0.8, 0.94, 0.96, 1.04, 1.15, 1.3])
+@pytest.mark.parametrize("dt", [0.02, 0.9, 1.1])
+def test_the_rate_limit_acts_from_where_it_stands(share, dt):
+    """Also where a shortcut is taken, by the chord in place of the angle."""
+    rate = 0.5
+    turn = share * rate * dt
+    frame = Frame((math.cos(turn), math.sin(turn), 0.0), (-math.sin(turn), math.cos(turn), 0.0), ZERO, 9.0, 9.0)
+    out = limit_rate(frame, DOWN[0], (0.0, 1.0, 0.0), rate, dt)
+    turned = min(turn, rate * dt)
+    assert out.r2d == pytest.approx((-math.sin(turned), math.cos(turned), 0.0), abs=1e-12)
+    assert (out == frame) == (share < 1.0)
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 1), (1, 2), (2, 0)])
+def test_the_rate_limit_takes_no_direction_for_one_that_mirrors_it(i, j):
+    rate, dt, k = 0.5, 0.02, 3 - i - j
+    r3 = tuple(float(axis == k) for axis in range(3))
+
+    def direction(eighths):
+        along = {i: math.cos(math.pi / 4 * eighths), j: math.sin(math.pi / 4 * eighths), k: 0.0}
+        return tuple(along[axis] for axis in range(3))
+
+    for first, second in itertools.permutations(range(8), 2):
+        wanted, last = direction(second), direction(first)
+        out = limit_rate(Frame(tuple(np.cross(wanted, r3)), wanted, ZERO, 9.0, 9.0), r3, last, rate, dt)
+        assert math.acos(min(dot(out.r2d, last), 1.0)) == pytest.approx(rate * dt, abs=1e-7)
 
 
 def test_slow_path_holds_the_last_direction_with_hysteresis():
