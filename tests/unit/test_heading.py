@@ -25,7 +25,7 @@ from companion.control.heading import (
 )
 from companion.control.law import ControllerState
 from companion.control.types import Reference, State
-from companion.control.vectors import axes, cross, dot, norm, quat_exp
+from companion.control.vectors import axes, cross, dot, norm, quat_exp, quat_multiply
 
 DOWN = ((0.0, 0.0, 1.0), ZERO, ZERO)
 
@@ -152,6 +152,28 @@ def test_commanded_heading_feeds_rate_and_acceleration_forward(yaw, off, rate, a
     assert error == pytest.approx(off, abs=1e-9)
 
 
+@given(q=quaternions, w=vectors(2.0), force=st.tuples(vectors(2.0), vectors(2.0), vectors(2.0)), yaw=numbers(-3, 3))
+def test_the_torque_is_that_of_42_with_the_error_rate_of_a_turning_body(q, w, force, yaw):
+    """tau3 = -l2 (w3 - w3d + l1 r2d . r1) + w3d' - l1 d/dt(r2d . r1), the last one by finite differences."""
+    force = (tuple(np.array(force[0]) + np.array([0.0, 0.0, 9.81])), force[1], force[2])
+    l1, l2 = 1.3, 0.8
+    state = State(ZERO, ZERO, q, w)
+    ref = Reference(*[ZERO] * 5, yaw, 0.2, -0.1)
+    tau3, _, error = torque(state, ref, force, memory(), COMMANDED, (l1, l2, 2.0), (9.0, 0.1), 0.0)
+    forward = forward_direction(ref, unit_rate(*force[:2])[0], memory(), COMMANDED, 0.1)[:3]
+    frame = desired_frame(force, unit_rate(*force[:2]), *forward)
+    h = 1e-6
+
+    def along(t):
+        turned = axes(quat_multiply(q, quat_exp(tuple(t * x for x in w))))
+        return dot(tuple(np.array(frame.r2d) + t * np.array(frame.r2d_rate)), turned[0])
+
+    rate = (along(h) - along(-h)) / (2 * h)
+    expected = -l2 * (w[2] - frame.w3d + l1 * along(0.0)) + frame.w3d_rate - l1 * rate
+    assert tau3 == pytest.approx(expected, abs=1e-7 * (1.0 + abs(expected)))
+    assert math.tan(error) == pytest.approx(along(0.0) / dot(frame.r1d, axes(q)[0]), rel=1e-6, abs=1e-9)
+
+
 def test_damping_and_missing_thrust_direction_only_damp():
     tau3, after, error = torque(
         level(0.3, 0.5), moving((1.0, 0.0, 0.0)), GRAVITY, memory(), DAMPING, GAINS, (1.0, 0.1), 0.01
@@ -195,6 +217,7 @@ def test_the_rate_limit_holds_about_any_axis(q, turn, off, dt):
     assert np.array(out.r2d) == pytest.approx(math.cos(turned) * r2 - math.sin(turned) * r1, abs=1e-9)
     assert np.array(out.r1d) == pytest.approx(np.cross(out.r2d, r3), abs=1e-9)
     assert (out.w3d, out.w3d_rate) == (math.copysign(rate, turn), 0.0)
+    assert np.array(out.r2d_rate) == pytest.approx(-out.w3d * np.array(out.r1d))
 
 
 @pytest.mark.parametrize("share", [0.8, 0.94, 0.96, 1.04, 1.15, 1.3])

@@ -16,6 +16,7 @@ from law_cases import (
     memory,
     near_states,
     parameters,
+    quaternions,
     rising,
     vectors,
 )
@@ -323,6 +324,13 @@ def test_projection_never_adds_to_the_lyapunov_function(b, y):
 
 
 @given(b=vectors(1.9), y=vectors(3.0))
+def test_the_projection_begins_at_nine_tenths_of_the_ball(b, y):
+    rate = law.estimator_rate(law.Errors(ZERO, y, ZERO, ZERO, ZERO), b, 1.5, 2.0)
+    projected = norm(b) > 0.9 * 2.0 and dot(b, y) > 1e-9
+    assert (rate != tuple(1.5 * x for x in y)) == projected or abs(norm(b) - 1.8) < 1e-6
+
+
+@given(b=vectors(1.9), y=vectors(3.0))
 def test_the_projection_takes_away_a_share_of_what_points_outwards_and_nothing_else(b, y):
     bound, b = 2.0, np.array(b)
     inner = (1.0 - law.PROJECTION_LAYER) * bound
@@ -336,6 +344,28 @@ def test_the_projection_takes_away_a_share_of_what_points_outwards_and_nothing_e
     share = min(1.0, (size_sq - inner**2) / (bound**2 - inner**2))
     assert b @ rate == pytest.approx((1.0 - share) * outward, abs=1e-9)
     assert np.cross(b, rate) == pytest.approx(np.cross(b, free), abs=1e-9)
+
+
+@given(thrust=st.floats(10.0, 100.0), q=quaternions, bound=st.floats(0.5, 5.0))
+def test_the_start_explains_the_hover_as_far_as_the_ball_reaches(thrust, q, bound):
+    found, b_hat = law.start(thrust, q, MASS, G, bound)
+    missing = thrust / MASS * np.array(axes(q)[2]) - np.array([0.0, 0.0, G])
+    assert found == thrust
+    assert np.array(b_hat) == pytest.approx(missing * min(1.0, bound / np.linalg.norm(missing)))
+
+
+@given(e1=vectors(9.0), e2=vectors(2.0), e3=vectors(2.0), e4=vectors(2.0), p_max=st.floats(0.5, 5.0))
+def test_the_lyapunov_function_is_the_integral_of_the_bounded_error_and_squares(e1, e2, e3, e4, p_max):
+    size = norm(e1)
+    reached = np.linspace(0.0, size, 20001)
+    potential = np.trapezoid(np.minimum(reached, p_max), reached)
+    squares = 0.5 * sum(dot(e, e) for e in (e2, e3, e4))
+    assert law.lyapunov(law.Errors(e1, e2, e3, e4, ZERO), p_max) == pytest.approx(potential + squares, rel=1e-6)
+
+
+def test_each_limit_has_a_bit_of_its_own():
+    flags = [value for name, value in vars(law).items() if name.startswith("LIMIT_")]
+    assert sorted(flags) == [1 << i for i in range(len(flags))]
 
 
 def test_start_from_a_tilted_hover_does_not_step():
