@@ -15,6 +15,7 @@ from law_cases import (
     far_states,
     memory,
     near_states,
+    numbers,
     parameters,
     quaternions,
     rising,
@@ -224,6 +225,63 @@ def level_state(p=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0)):
     return State(p, v, LEVEL, (0.0, 0.0, 0.0))
 
 
+def clipped(x, low, high):
+    return min(max(x, low), high)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    state=st.one_of(near_states, far_states),
+    thrust=st.sampled_from([20.0, 20.05, 30.0, 45.0, 59.95, 60.0]),
+    rate=numbers(-200.0, 200.0),
+    b_hat=vectors(1.1),
+    lead=vectors(0.5),
+    frozen=st.booleans(),
+    dt=st.sampled_from([0.004, 0.02]),
+)
+def test_the_step_integrates_what_the_law_gives_and_cuts_it_as_section_8_says(
+    state, thrust, rate, b_hat, lead, frozen, dt
+):
+    p = parameters(PAPER_GAINS._replace(heading_kind=COMMANDED), 0.3, TIGHT)
+    lags, integral, rotors = (0.05, 0.06, 0.1), np.array([1.3, 0.9, 0.4]), 0.05
+    p = p._replace(model=p.model._replace(rate_lag=lags, rate_integral=tuple(integral), thrust_lag=rotors))
+    ctrl = ControllerState(thrust, rate, b_hat, memory(), lead)
+    command, after, out = step(state, rising(2.0), ctrl, p, frozen, dt)
+    low, high, most = TIGHT.thrust_min, TIGHT.thrust_max, np.array(TIGHT.rate_max)
+    stopped = frozen or not low < thrust < high
+    assert out == evaluate(state, rising(2.0), ctrl, p, stopped, dt)
+    flags = law.LIMIT_ESTIMATOR_FROZEN * stopped
+
+    free = thrust + dt * rate + dt**2 / 2 * out.thrust_acceleration
+    free_rate = rate + dt * out.thrust_acceleration
+    assert after.thrust == pytest.approx(clipped(free, low, high))
+    inside = low < free < high
+    back = clipped(free_rate, 0.0, math.inf) if free <= low else clipped(free_rate, -math.inf, 0.0)
+    assert after.thrust_rate == pytest.approx(free_rate if inside else back)
+    flags |= law.LIMIT_THRUST_MIN * (free <= low) | law.LIMIT_THRUST_MAX * (free >= high)
+
+    estimate = np.array(b_hat) + dt * np.array(out.b_hat_rate)
+    size, bound = np.linalg.norm(estimate), TIGHT.disturbance_max
+    assert np.array(after.b_hat) == pytest.approx(estimate * min(1.0, bound / max(size, 1e-9)))
+    flags |= law.LIMIT_DISTURBANCE * bool(size > 0.9 * bound)
+
+    w = np.array(state.w)
+    wanted = w + np.array(out.tau) * dt / (1.0 - np.exp(-dt / np.array(lags)))
+    over = max(np.abs(wanted[:2] / most[:2]).max(), 1.0)
+    flags |= law.LIMIT_ROLL_PITCH_RATE * bool(over > 1.0) | law.LIMIT_YAW_RATE * bool(abs(wanted[2]) > most[2])
+    wanted = np.array([wanted[0] / over, wanted[1] / over, clipped(wanted[2], -most[2], most[2])])
+    assert np.array(command.rates_model) == pytest.approx(wanted)
+    assert np.array(command.rates) == pytest.approx(np.clip(wanted - integral * np.array(lead), -most, most))
+    change = wanted - w - (integral + 0.2) * np.array(lead)
+    assert np.array(after.lead_integral) == pytest.approx(np.array(lead) + dt * change)
+
+    ahead = thrust + (clipped(free, low, high) - thrust) / (1.0 - math.exp(-dt / rotors))
+    assert command.thrust == pytest.approx(clipped(ahead, low, high))
+    flags |= law.LIMIT_THRUST_MIN * (ahead < low) | law.LIMIT_THRUST_MAX * (ahead > high)
+    assert command.limits == flags
+    assert command.tau == out.tau and after.heading == out.heading
+
+
 def test_at_the_thrust_limit_only_the_way_back_is_open_and_the_estimator_stops():
     p = parameters(limits=TIGHT)
     low = level_state(p=(0.0, 0.0, -4.0))  # far too high: the law wants less and less thrust
@@ -361,6 +419,14 @@ def test_the_lyapunov_function_is_the_integral_of_the_bounded_error_and_squares(
     potential = np.trapezoid(np.minimum(reached, p_max), reached)
     squares = 0.5 * sum(dot(e, e) for e in (e2, e3, e4))
     assert law.lyapunov(law.Errors(e1, e2, e3, e4, ZERO), p_max) == pytest.approx(potential + squares, rel=1e-6)
+
+
+@pytest.mark.parametrize(("speed", "held"), [(0.1, True), (1.0, False)])
+def test_a_step_says_that_the_heading_is_held(speed, held):
+    ref = HOVER._replace(v=(speed, 0.0, 0.0))
+    ctrl = ControllerState(MASS * G, 0.0, ZERO, memory(), ZERO)
+    command, after, _ = step(level_state(), ref, ctrl, parameters(limits=TIGHT), False, 0.01)
+    assert (bool(command.limits & law.LIMIT_HEADING_HELD), after.heading.held) == (held, held)
 
 
 def test_each_limit_has_a_bit_of_its_own():
