@@ -43,7 +43,9 @@ WARM = (
     *("pymavlink.dialects.v20.development", "sim_link.pytest_plugin"),  # the plugin shares no code with the companion
 )
 TIME_MAX_S = 60.0
-"""Beyond this a test hangs [s]: all tests of a module take a tenth of it."""
+"""Beyond this all tests of a module hang [s]: they take a tenth of it."""
+TEST_MAX_S = 15.0
+"""The same for one of them: a wrong law can make an integrator crawl."""
 _SWAPS: dict[type[ast.AST], type[ast.AST]] = {
     **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
     **{ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And},
@@ -198,7 +200,17 @@ def _in_child(module: str, index: int) -> None:
         if index >= 0:
             sys.meta_path.insert(0, _Overlay(module, changed(module, index)))
         tests = [str(ROOT / "tests" / "unit" / name) for name in TESTS[module]]
-        options = ["-q", "-x", "-p", "no:cacheprovider", "--tb=no", "-m", "not long", "--hypothesis-seed=0"]
+        options = [
+            "-q",
+            "-x",
+            "-p",
+            "no:cacheprovider",
+            "--tb=no",
+            "-m",
+            "not long",
+            "--hypothesis-seed=0",
+            f"--timeout={TEST_MAX_S:g}",
+        ]
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             code = int(pytest.main([*tests, *options]))
     finally:
