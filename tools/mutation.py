@@ -60,11 +60,14 @@ class Mutant(NamedTuple):
     line: int
     column: int
     change: str
+    twin: int
+    """How many others begin at the same place and change the same: a + b + c has two additions that begin at a."""
 
     @property
     def name(self) -> str:
         """What it is known by."""
-        return f"{self.module}:{self.line}:{self.column} {self.change}"
+        which = f" ({self.twin + 1})" if self.twin else ""
+        return f"{self.module}:{self.line}:{self.column} {self.change}{which}"
 
 
 class _Mutator(ast.NodeTransformer):
@@ -75,7 +78,8 @@ class _Mutator(ast.NodeTransformer):
         self._module, self._index = module, index
 
     def _here(self, node: Any, change: str) -> bool:
-        self.found.append(Mutant(self._module, node.lineno, node.col_offset, change))
+        place = (self._module, node.lineno, node.col_offset, change)
+        self.found.append(Mutant(*place, sum(mutant[:-1] == place for mutant in self.found)))
         return len(self.found) - 1 == self._index
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
@@ -200,17 +204,8 @@ def _in_child(module: str, index: int) -> None:
         if index >= 0:
             sys.meta_path.insert(0, _Overlay(module, changed(module, index)))
         tests = [str(ROOT / "tests" / "unit" / name) for name in TESTS[module]]
-        options = [
-            "-q",
-            "-x",
-            "-p",
-            "no:cacheprovider",
-            "--tb=no",
-            "-m",
-            "not long",
-            "--hypothesis-seed=0",
-            f"--timeout={TEST_MAX_S:g}",
-        ]
+        options = ["-q", "-x", "-p", "no:cacheprovider", "--tb=no", f"--timeout={TEST_MAX_S:g}"]
+        options += ["-m", "not long", "--hypothesis-seed=0"]
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             code = int(pytest.main([*tests, *options]))
     finally:
