@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAW_TESTS = ("test_law.py", "test_tracker.py", "test_heading.py", "test_output.py", "test_certificate.py")
 TESTS: dict[str, tuple[str, ...]] = {
     "companion/flight/guards.py": ("test_guards.py", "test_docs_guards.py", "test_flight_responses.py"),
-    "companion/control/vectors.py": LAW_TESTS,
+    "companion/control/vectors.py": ("test_vectors.py", *LAW_TESTS),
     "companion/control/heading.py": ("test_heading.py", "test_law.py"),
     "companion/control/output.py": ("test_output.py", "test_tracker.py"),
     "companion/control/certificate.py": ("test_certificate.py", "test_guards.py"),
