@@ -316,7 +316,8 @@ def evaluate(
     if not frozen and gamma > 0.0:
         b_hat_rate = estimator_rate(e, b_hat, gamma, limits.disturbance_max)
         # b_hat'' is needed by the heading only, and is left out while the projection bends b_hat'
-        if b_hat_rate[0] == gamma * (e.e2[0] + e.e3[0] + e.e4[0]):
+        x, y, z = e.e2[0] + e.e3[0] + e.e4[0], e.e2[1] + e.e3[1] + e.e4[1], e.e2[2] + e.e3[2] + e.e4[2]
+        if b_hat_rate == (gamma * x, gamma * y, gamma * z):
             e1_rate = (v[0] - vd[0], v[1] - vd[1], v[2] - vd[2])
             e2r, e3r, e4r = error_rates(e, e1_rate, b_hat_rate, gains, d)
             b_hat_acceleration = (

@@ -234,7 +234,7 @@ def clipped(x, low, high):
     state=st.one_of(near_states, far_states),
     thrust=st.sampled_from([20.0, 20.05, 30.0, 45.0, 59.95, 60.0]),
     rate=numbers(-200.0, 200.0),
-    b_hat=vectors(1.1),
+    b_hat=st.one_of(vectors(1.1), st.floats(1.65, 1.99).map(lambda size: (0.0, -0.6 * size, 0.8 * size))),
     lead=vectors(0.5),
     frozen=st.booleans(),
     dt=st.sampled_from([0.004, 0.02]),
@@ -305,6 +305,22 @@ def test_a_frozen_estimator_uses_zero_everywhere():
     off = evaluate(state, HOVER, ctrl, parameters(PAPER_GAINS._replace(gamma=0.0)), False, 0.0)
     assert frozen.tau == off.tau and frozen.b_hat_rate == (0.0, 0.0, 0.0)
     assert frozen.thrust_acceleration == off.thrust_acceleration
+
+
+@pytest.mark.parametrize(("b_hat", "frozen"), [(ZERO, True), ((0.0, 0.0, 1.95), False)], ids=["frozen", "projected"])
+def test_while_the_estimate_does_not_follow_the_heading_is_told_of_the_references_snap_alone(
+    b_hat, frozen, monkeypatch
+):
+    told = []
+    heard = law.heading_torque
+    monkeypatch.setattr(law, "heading_torque", lambda *said: told.append(said[2]) or heard(*said))
+    p = parameters(drag=0.3, limits=TIGHT)
+    ctrl = ControllerState(MASS * G, 1.0, b_hat, memory(), ZERO)
+    ref = rising(1.0)
+    out = evaluate(State((0.5, 0.1, 2.3), *level_state()[1:]), ref, ctrl, p, frozen, 0.0)
+    free = [2.0 * sum(e[axis] for e in out.errors[1:4]) for axis in range(3)]
+    assert frozen or np.abs(np.array(out.b_hat_rate) - free).max() > 0.1
+    assert told[0][2] == pytest.approx(tuple(-s - 0.3 * j for s, j in zip(ref.s, ref.j, strict=True)))
 
 
 @settings(max_examples=60, deadline=None)
@@ -383,9 +399,10 @@ def test_projection_never_adds_to_the_lyapunov_function(b, y):
 
 @given(b=vectors(1.9), y=vectors(3.0))
 def test_the_projection_begins_at_nine_tenths_of_the_ball(b, y):
+    if abs(dot(b, y)) < 1e-6 or abs(norm(b) - 1.8) < 1e-6:
+        return
     rate = law.estimator_rate(law.Errors(ZERO, y, ZERO, ZERO, ZERO), b, 1.5, 2.0)
-    projected = norm(b) > 0.9 * 2.0 and dot(b, y) > 1e-9
-    assert (rate != tuple(1.5 * x for x in y)) == projected or abs(norm(b) - 1.8) < 1e-6
+    assert (rate != tuple(1.5 * x for x in y)) == (norm(b) > 0.9 * 2.0 and dot(b, y) > 0.0)
 
 
 @given(b=vectors(1.9), y=vectors(3.0))
