@@ -52,7 +52,7 @@ def test_a_rotation_vectors_quaternion_is_exact_also_where_it_hardly_turns(direc
     found = v.quat_exp(v.scale(angle, unit))
     expected = (math.cos(angle / 2), *v.scale(math.sin(angle / 2), unit))
     for got, wanted in zip(found, expected, strict=True):
-        assert got == pytest.approx(wanted, rel=1e-14, abs=1e-18)
+        assert got == pytest.approx(wanted, rel=1e-14, abs=1e-24)
 
 
 @given(q=quaternions, s=numbers(0.1, 9.0))
