@@ -377,6 +377,7 @@ def test_what_the_autopilots_integral_will_add_is_taken_out_and_forgotten_slowly
 def test_the_rate_setpoint_inverts_a_first_order_loop(lag, dt, w, tau):
     target = law.rate_setpoint(w, tau, lag, dt)
     assert target + (w - target) * math.exp(-dt / lag) == pytest.approx(w + tau * dt, abs=1e-9)
+    assert law.rate_setpoint(w, tau, 0.0, dt) == w + tau * dt
 
 
 @given(b=vectors(1.9), y=vectors(3.0))
