@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from law_cases import (
     MASS,
@@ -399,6 +399,7 @@ def test_projection_never_adds_to_the_lyapunov_function(b, y):
 
 
 @given(b=vectors(1.9), y=vectors(3.0))
+@example(b=(0.0, 0.0, 1.95), y=(0.5, 0.0, 0.2))
 def test_the_projection_begins_at_nine_tenths_of_the_ball(b, y):
     if abs(dot(b, y)) < 1e-6 or abs(norm(b) - 1.8) < 1e-6:
         return
