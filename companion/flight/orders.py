@@ -143,15 +143,19 @@ class Orders:
         return True
 
     def _end_before(self, order: Order, now_s: float) -> None:
-        """Before the course, or after it: nothing of ours is flying."""
+        """Before the course, or after it: nothing of ours is flying.
+
+        In a take-off the autopilot may have armed and not said so yet: it is asked for Hold, or to land, all the same.
+        """
         sequence, autopilot = self._sequence, self._autopilot
+        asked_nothing = sequence.phase in {Phase.CONNECT, Phase.PREFLIGHT}
         grounded = autopilot.landed is LandedState.ON_GROUND
-        if grounded and (sequence.phase is Phase.LAND or not autopilot.armed):
+        if grounded and (sequence.phase is Phase.LAND or (asked_nothing and not autopilot.armed)):
             raise FlightEnded(Cause.STOPPED, "the vehicle is on the ground")
         if order is Order.LAND:
             if sequence.phase is not Phase.LAND:
                 sequence.land_from_here(now_s)
-        elif sequence.phase in {Phase.CONNECT, Phase.PREFLIGHT}:
+        elif asked_nothing:
             raise FlightEnded(Cause.STOPPED, "before anything was asked of the vehicle")
         else:
             sequence.end(Cause.STOPPED, "", now_s)

@@ -36,6 +36,8 @@ STREAM_BEFORE_OFFBOARD_S = 1.0
 """Hold setpoints go out for this long before OFFBOARD is asked for; PX4 needs one, older versions more."""
 OFFBOARD_TIMEOUT_S = 5.0
 TAKEOFF_TIMEOUT_S = 60.0
+TAKEOFF_SLOWEST_M_S = 1.0
+"""A take-off may last that long, and at this speed the time that its height takes."""
 LANDING_TIMEOUT_S = 120.0
 SETTLED_SPEED_M_S = 0.3
 SETTLED_FOR_S = 1.0
@@ -62,7 +64,7 @@ FRESH_S = 0.5
 REASON_WAIT_S = 0.5
 """The autopilot's words about a refusal may come after its answer."""
 
-_AWAITED = {Phase.TAKEOFF: modes.TAKEOFF, Phase.LAND: modes.LAND}
+_AWAITED = {Phase.TAKEOFF: modes.TAKEOFF, Phase.JOIN: modes.HOLD, Phase.LAND: modes.LAND}
 """The autopilot's own modes that a phase asks for."""
 
 
@@ -133,7 +135,8 @@ class Sequence:
         self._settled_since_s: float | None = None
         self._mode_seen = False
         self._mode_at_end: Mode | None = None
-        self._mode_at_landing: Mode | None = None
+        self._mode_at_entry: Mode | None = None
+        """Of the phase."""
         self._confirmed_hold_s: float | None = None
         self._rungs: tuple[Mode, ...] = self.ladder
         self._refusals = 0
@@ -169,7 +172,9 @@ class Sequence:
     # -- events ---------------------------------------------------------------------------------------------------
 
     def enter(self, phase: Phase, now_s: float, reason: str) -> None:
-        """Changes the phase; the reason goes into the log."""
+        """Changes the phase; the reason goes into the log. What the phase before asked for is asked for no more."""
+        self._ops.drop_moving(now_s)
+        self._mode_at_entry = self._autopilot.mode
         self.phase = phase
         self.changes.append(PhaseChange(phase.value, now_s, reason))
         self._since_s = now_s
@@ -243,11 +248,14 @@ class Sequence:
         if self.ending is not None:
             return
         self.ending = (cause, detail)
+        self._ops.drop_moving(now_s)
         self._rungs, self._refusals = rungs or self.ladder, 0
         self._operation = None
         self._step_s = now_s - HANDOVER_INTERVAL_S
         self._since_s = now_s
-        self._mode_at_end = self._autopilot.mode
+        allowed, mode = self._allowed_modes(), self._autopilot.mode
+        others = self._other_mode_s is not None or (allowed is not None and mode not in allowed)
+        self._mode_at_end = None if others else mode
         self._notify(f"ending: {cause.value.sentence}" + (f": {detail}" if detail else ""))
         if self.climb is not None:
             self.climb.stop(self.stamp_s)
@@ -294,11 +302,7 @@ class Sequence:
             self._asked = True
             self._operation = self._ops.arm(now_s)
             return
-        if now_s - self._since_s > TAKEOFF_TIMEOUT_S:
-            self.end(Cause.REFUSED, f"no steady hold was reached within {TAKEOFF_TIMEOUT_S:g} s of take-off", now_s)
-            return
-        if not self._autopilot.armed and now_s - self._since_s > CONFIRM_TIMEOUT_S + 1.0:
-            self.end(Cause.REFUSED, "the autopilot disarmed before it took off", now_s)
+        if self._takes_too_long(now_s) or self._disarmed(self._operation, now_s):
             return
         steady = (
             self._autopilot.mode == modes.HOLD
@@ -316,9 +320,9 @@ class Sequence:
     def _climb_in_offboard(self, now_s: float) -> None:
         """Setpoints for where it stands, Offboard, arming; then the point rises, and at the top Hold is asked for."""
         state, autopilot = self._state, self._autopilot
-        if now_s - self._since_s > TAKEOFF_TIMEOUT_S:
-            self.end(Cause.REFUSED, f"no steady hold was reached within {TAKEOFF_TIMEOUT_S:g} s of take-off", now_s)
-        elif self.climb is None:
+        if self._takes_too_long(now_s):
+            return
+        if self.climb is None:
             if state is not None and now_s - self._state_s < FRESH_S:
                 self.climb = Climb(state, self._flight.takeoff_altitude_m)
                 self.duty, self._step_s = Duty.CLIMB, now_s
@@ -333,23 +337,36 @@ class Sequence:
             self._operation = self._ops.arm(now_s)
             self._since_s = now_s
         elif not self._leaving:
-            self._rise(self.climb, state, now_s)
+            self._rise(self.climb, state, self._operation, now_s)
         elif autopilot.mode == modes.HOLD:
             self.duty, self.climb = Duty.NOTHING, None
             self.enter(Phase.JOIN, now_s, "the vehicle holds at its take-off height, climbed to in Offboard")
             self._hold_first(now_s)
 
-    def _rise(self, climb: Climb, state: VehicleState, now_s: float) -> None:
+    def _rise(self, climb: Climb, state: VehicleState, arming: Operation, now_s: float) -> None:
         """Armed: the point rises once Offboard is reported; at the top Hold is asked for."""
         autopilot = self._autopilot
-        if not autopilot.armed:
-            if now_s - self._since_s > CONFIRM_TIMEOUT_S + 1.0:
-                self.end(Cause.REFUSED, "the autopilot disarmed before it took off", now_s)
-        elif autopilot.mode == modes.OFFBOARD:
+        if not self._disarmed(arming, now_s) and autopilot.armed and autopilot.mode == modes.OFFBOARD:
             climb.begin(self.stamp_s)
             if climb.arrived(state) and self._slower_than(SETTLED_SPEED_M_S, now_s):
                 self._leaving = True
                 self._operation = self._ops.set_mode(modes.HOLD, now_s)
+
+    def _takes_too_long(self, now_s: float) -> bool:
+        """Whether the take-off should have been over; ends the flight then."""
+        limit_s = TAKEOFF_TIMEOUT_S + self._flight.takeoff_altitude_m / TAKEOFF_SLOWEST_M_S
+        if now_s - self._since_s <= limit_s:
+            return False
+        self.end(Cause.REFUSED, f"no steady hold was reached within {limit_s:g} s of take-off", now_s)
+        return True
+
+    def _disarmed(self, arming: Operation, now_s: float) -> bool:
+        """Whether the vehicle is not armed although it should be told by now that it is; ends the flight then."""
+        begun_s = self._since_s if arming.ended_s is None else arming.ended_s
+        if self._autopilot.armed or now_s - begun_s <= CONFIRM_TIMEOUT_S + 1.0:
+            return False
+        self.end(Cause.REFUSED, "the autopilot disarmed before it took off", now_s)
+        return True
 
     def _refused(self, operation: Operation, now_s: float) -> bool:
         """Whether the autopilot refused what was asked; ends the flight with its reason, which may come a little
@@ -492,7 +509,6 @@ class Sequence:
 
     def land_from_here(self, now_s: float) -> None:
         """The operator wants the vehicle to land, whatever phase this is."""
-        self._mode_at_landing = self._autopilot.mode
         if self.duty is not Duty.TRACK:
             self.duty = Duty.NOTHING
         self.enter(Phase.LAND, now_s, "the operator asks for a landing")
@@ -506,7 +522,9 @@ class Sequence:
             self.duty = Duty.NOTHING
         elif self._refused(self._operation, now_s):
             return
-        if self.duty is Duty.NOTHING and self._autopilot.landed is LandedState.ON_GROUND and not self._autopilot.armed:
+        down = self._autopilot.landed is LandedState.ON_GROUND and not self._autopilot.armed
+        told = now_s - self._since_s > CONFIRM_TIMEOUT_S  # also of an arming that went out just before
+        if self.duty is Duty.NOTHING and down and told:
             cause = Cause.COMPLETED if self.orders.ended_by is None else Cause.STOPPED
             raise FlightEnded(cause, "landed and disarmed")
         if now_s - self._since_s > LANDING_TIMEOUT_S:
@@ -553,8 +571,15 @@ class Sequence:
             # On the ground PX4 goes back to the mode that was meant before, and says so before it says disarmed.
             if not self._autopilot.armed or self._autopilot.landed is LandedState.ON_GROUND:
                 return None
-            before = self._mode_at_landing or modes.OFFBOARD
-            return {modes.LAND} if self._mode_seen else {modes.OFFBOARD, modes.LAND, before}
+            if self._mode_seen:
+                return {modes.LAND}
+            before = self._mode_at_entry or modes.OFFBOARD
+            # a take-off ends in Hold by itself, and Hold may have been asked for just before
+            return {modes.OFFBOARD, modes.LAND, before} | ({modes.HOLD} if before != modes.OFFBOARD else set())
+        if self.phase is Phase.JOIN and self.duty is Duty.NOTHING:
+            # Hold is asked for once, out of the mode that the vehicle was found in; then it is to stay.
+            before = self._mode_at_entry or modes.HOLD
+            return {modes.HOLD} if self._mode_seen else {modes.HOLD, before}
         if self.duty is Duty.STREAM:
             return {modes.HOLD} if self._operation is None else {modes.HOLD, modes.OFFBOARD}
         return {modes.OFFBOARD} if self.duty is Duty.TRACK else None

@@ -24,7 +24,7 @@ from companion.errors import CompanionError, ExitCode, InputError, LinkError
 from companion.flight.accounting import Progress
 from companion.flight.connect import AUTOPILOT_COMPONENT
 from companion.flight.loop import FlightLoop
-from companion.flight.phases import Cause, Order, Phase
+from companion.flight.phases import Cause, LandedState, Order, Phase
 from companion.flight.process import Status, ask_the_system, warm_up
 from companion.flight.retuning import ParameterChange
 from companion.flight.tracker import kernels
@@ -342,7 +342,8 @@ class Control:
         if order is Order.RESUME:
             return loop.phase in {Phase.JOIN, Phase.TRACK, Phase.HOLD} and not over
         if order is Order.LAND:
-            return over or (loop.phase is Phase.LAND and loop.autopilot.mode == modes.LAND)
+            landing = loop.phase is Phase.LAND and loop.autopilot.mode == modes.LAND
+            return landing or (over and loop.autopilot.landed is LandedState.ON_GROUND)
         return over
 
     def _order_idle(self, number: int, order: Order) -> str:

@@ -64,6 +64,11 @@ class _Lane:
 
     def replace(self, request: _Request, now_s: float) -> None:
         """Send a request at once instead of everything before it."""
+        self.drop(now_s)
+        self._start(request, now_s)
+
+    def drop(self, now_s: float) -> None:
+        """Ask for nothing more; what is in the air may still be answered, and those answers are nobody's."""
         for old in self._waiting:
             old.operation.end(Result.SUPERSEDED, now_s)
         self._waiting.clear()
@@ -73,7 +78,7 @@ class _Lane:
             self._stale_acks += self._current.operation.sends
             self._stale_until_s = now_s + STALE_S
             self._current.operation.end(Result.SUPERSEDED, now_s)
-        self._start(request, now_s)
+            self._current = None
 
     def on_ack(self, ack: CommandAck, now_s: float) -> None:
         """Take an acknowledgement of this command."""
@@ -170,6 +175,12 @@ class CommandQueue:
             return same
         lane.replace(request, operation.asked_s)
         return operation
+
+    def drop(self, command: int, now_s: float) -> None:
+        """Ask for a command no more."""
+        lane = self._lanes.get(command)
+        if lane is not None:
+            lane.drop(now_s)
 
     def on_ack(self, ack: CommandAck, now_s: float) -> None:
         """Take an acknowledgement that is meant for us."""

@@ -45,6 +45,8 @@ class Command(IntEnum):
 
 # A new request of these says that the one before is no longer wanted; it must not wait behind it.
 _NEWEST_WINS: Final = {Command.DO_SET_MODE, Command.COMPONENT_ARM_DISARM}
+# What moves the vehicle, and must not be repeated once something else is wanted.
+_MOVING: Final = (Command.DO_SET_MODE, Command.COMPONENT_ARM_DISARM, Command.NAV_TAKEOFF, Command.NAV_LAND)
 
 
 class Operations:
@@ -114,6 +116,11 @@ class Operations:
     def land(self, now_s: float, retry: Retry = DEFAULT_RETRY) -> Operation:
         """Ask for a landing here, heading as it is."""
         return self.command(Command.NAV_LAND, (_NAN,) * 7, "landing", now_s, retry)
+
+    def drop_moving(self, now_s: float) -> None:
+        """Repeat no request for a mode, arming, a take-off or a landing any more: something else is wanted now."""
+        for command in _MOVING:
+            self._commands.drop(command, now_s)
 
     def set_message_interval(
         self, msgid: int, interval_us: int, now_s: float, retry: Retry = DEFAULT_RETRY

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flight_cases import HOLD, HOVER, INDOOR, LAND, OFFBOARD, Flown, Stand, make_flight
+import pytest
+from flight_cases import COMMAND_ACK, HOLD, HOVER, INDOOR, LAND, OFFBOARD, Flown, Stand, make_flight
 
 from companion.campaign.replay import replay
 from companion.flight.loop import FlightLoop
@@ -91,3 +92,54 @@ def test_land_out_of_the_air(tmp_path: Path) -> None:
     assert refusals == [""]
     assert flown.outcome.sentence == "stopped by the operator: landed and disarmed"
     assert flown.phases[-2:] == ["hold", "land"]
+
+
+@pytest.mark.parametrize(("order", "mode"), [(Order.STOP, Mode.HOLD), (Order.LAND, Mode.LAND)])
+def test_an_order_between_arming_and_its_heartbeat_keeps_the_vehicle_down(
+    order: Order, mode: Mode, tmp_path: Path
+) -> None:
+    armed_us: list[int] = []
+    given: list[tuple[str, bool, bool]] = []
+
+    with Stand(make_flight(takeoff_altitude_m=3.0), tmp_path, start=None) as stand:
+
+        def alter(stand: Stand, number: int, raw: bytes) -> list[bytes]:
+            vehicle = stand.vehicle.autopilot.armed
+            if vehicle and not armed_us:
+                armed_us.append(stand.t_us)
+            if armed_us and not given and stand.t_us - armed_us[0] > 0.2e6:
+                given.append((loops[0].order(order), vehicle, loops[0].autopilot.armed))
+            return [raw]
+
+        loops: list[FlightLoop] = []
+        stand.alter = alter
+        flown = stand.fly(loops.append)
+        assert given == [("", True, False)], "armed, and not said yet"
+        assert flown.cause is Cause.STOPPED
+        assert stand.mode is mode
+        assert stand.vehicle.airframe.truth().p[2] > -0.1, "it did not take off"
+
+
+def test_a_lost_answer_to_offboard_brings_it_back_after_no_landing(tmp_path: Path) -> None:
+    """A request that was not answered is not repeated once the operator wants something else."""
+    lost: list[int] = []
+    ordered_at: list[float] = []
+    seen: list[Mode] = []
+    with Stand(make_flight(), tmp_path) as stand:
+
+        def alter(stand: Stand, number: int, raw: bytes) -> list[bytes]:
+            seen.append(stand.mode)
+            if stand.offboard_s > 0.2 and not ordered_at:
+                ordered_at.append(stand.offboard_s)
+                assert loops[0].order(Order.LAND) == ""
+            if number == COMMAND_ACK and stand.mode is Mode.OFFBOARD and not lost and not ordered_at:
+                lost.append(stand.t_us)
+                return []
+            return [raw]
+
+        loops: list[FlightLoop] = []
+        stand.alter = alter
+        flown = stand.fly(loops.append)
+    assert lost and ordered_at
+    assert Mode.OFFBOARD not in seen[seen.index(Mode.LAND) :]
+    assert (flown.cause, flown.outcome.detail) == (Cause.STOPPED, "landed and disarmed")

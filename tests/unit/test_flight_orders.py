@@ -156,6 +156,30 @@ def test_stop_and_land_on_the_ground_end_at_once() -> None:
         assert (ended.cause, ended.detail) == (Cause.STOPPED, "the vehicle is on the ground")
 
 
+@pytest.mark.parametrize("order", [Order.STOP, Order.LAND])
+def test_once_arming_was_asked_for_the_ground_is_no_end(order: Order) -> None:
+    """HEARTBEAT, which says armed, may be a second away: the autopilot is asked for Hold, or to land."""
+    script = Script(landed=LandedState.ON_GROUND, armed=False)
+    script.until(lambda: script.sequence.phase is Phase.TAKEOFF)
+    script.run(0.1)
+    assert script.ops.asked[-1].what == "arming"
+    script.be(modes.TAKEOFF)
+    assert give(script, order) == ""
+    script.run(0.1)
+    assert script.ops.asked[-1].what == {Order.STOP: "changing to Hold", Order.LAND: "landing"}[order]
+    if order is Order.STOP:
+        script.be(modes.HOLD)
+        assert script.ends(0.1).detail == "the vehicle is in Hold"
+        return
+    script.be(modes.LAND)
+    script.run(0.5)
+    script.autopilot.armed = True  # as the next HEARTBEAT says
+    script.run(5.0)
+    assert script.sequence.phase is Phase.LAND
+    script.autopilot.armed = False
+    assert script.ends(0.1).detail == "landed and disarmed"
+
+
 def test_another_hand_during_a_pause_ends_the_flight() -> None:
     script = on_course()
     give(script, Order.PAUSE)

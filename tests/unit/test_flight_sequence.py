@@ -61,6 +61,11 @@ class FakeOperations:
     def read_parameter(self, name: str, now_s: float, retry: Any = None) -> Operation:
         return self._ask(f"reading {name}", now_s, PARAMETERS.get(name))
 
+    def drop_moving(self, now_s: float) -> None:
+        for operation in self.asked:
+            if operation.pending:
+                operation.end(Result.SUPERSEDED, now_s)
+
     def ask_time(self, own_ns: int) -> None:
         """Nobody answers here."""
 
@@ -341,3 +346,123 @@ def test_hand_over_that_is_not_acknowledged_ends() -> None:
     assert ended.detail == "Hold was not acknowledged, the autopilot's own failsafe acts"
     assert script.now_s - begun_s == pytest.approx(3.0, abs=0.02)
     assert len(script.ops.since(asked)) in {30, 31}
+
+
+# -- other hands before the setpoints
+
+
+def test_pilot_takes_the_vehicle_back_while_the_course_is_planned() -> None:
+    """Hold was seen: no mode that comes after it is asked to be left again."""
+    script = Script()
+    script.be(modes.POSITION)
+    script.until(lambda: script.sequence.phase is Phase.JOIN)
+    script.speed = 2.0  # still braking: nothing is planned
+    script.be(modes.HOLD)
+    script.run(0.5)
+    asked = len(script.ops.asked)
+    script.be(modes.POSITION)
+    ended = script.ends()
+    assert (ended.cause, script.sequence.owes_hold) == (Cause.TAKEN_OVER, False)
+    assert script.ops.since(asked) == []
+
+
+def test_another_mode_than_the_one_that_it_was_found_in_is_another_hands() -> None:
+    script = Script()
+    script.be(modes.POSITION)
+    script.until(lambda: script.sequence.phase is Phase.JOIN)
+    asked = len(script.ops.asked)
+    script.be(modes.RETURN)
+    assert script.ends().cause is Cause.TAKEN_OVER
+    assert script.ops.since(asked) == []
+
+
+@pytest.mark.parametrize("waits_s", [0.0, 0.1])
+def test_ctrl_c_just_when_the_pilot_has_taken_over_leaves_the_vehicle_to_the_pilot(waits_s: float) -> None:
+    script = Script()
+    script.to_track()
+    asked = len(script.ops.asked)
+    script.autopilot.mode = modes.POSITION
+    script.run(waits_s)
+    script.sequence.interrupt(script.now_s)
+    assert "by another hand" in script.ends().detail
+    assert script.ops.since(asked) == []
+    assert not script.sequence.owes_hold
+
+
+# -- requests that were replaced
+
+
+def test_what_a_landing_replaces_is_asked_for_no_more() -> None:
+    script = Script()
+    script.ops.at_once = True
+    script.to_stream()
+    script.ops.at_once = False
+    script.until(lambda: script.ops.asked[-1].what == "changing to Offboard")
+    offboard = script.ops.asked[-1]
+    script.sequence.land_from_here(script.now_s)
+    assert offboard.result is Result.SUPERSEDED
+    script.run(0.01)
+    assert script.ops.asked[-1].what == "landing" and script.ops.asked[-1].pending
+
+
+def test_an_end_asks_for_arming_no_more() -> None:
+    script = Script(landed=LandedState.ON_GROUND, armed=False)
+    script.until(lambda: script.sequence.phase is Phase.TAKEOFF)
+    script.ops.at_once = False
+    script.run(0.01)
+    script.ops.asked[-1].end(Result.ACCEPTED, script.now_s)
+    script.run(0.01)
+    arming = script.ops.asked[-1]
+    script.sequence.interrupt(script.now_s)
+    assert (arming.what, arming.result) == ("arming", Result.SUPERSEDED)
+
+
+# -- take-off and landing by the clock
+
+
+def test_arming_that_was_acknowledged_late_is_given_its_heartbeats() -> None:
+    script = Script(landed=LandedState.ON_GROUND, armed=False)
+    script.until(lambda: script.sequence.phase is Phase.TAKEOFF)
+    script.ops.at_once = False
+    for acknowledged_s in (1.1, 1.7):
+        script.run(acknowledged_s)
+        script.ops.asked[-1].end(Result.ACCEPTED, script.now_s)
+    script.be(modes.TAKEOFF)
+    script.run(3.4)
+    assert script.sequence.ending is None
+    script.run(0.2)
+    assert script.sequence.ending == (Cause.REFUSED, "the autopilot disarmed before it took off")
+
+
+def test_a_high_take_off_may_last_longer() -> None:
+    script = Script(landed=LandedState.ON_GROUND, armed=True)
+    script.sequence._flight = script.sequence._flight.model_copy(update={"takeoff_altitude_m": 100.0})
+    script.until(lambda: script.sequence.phase is Phase.TAKEOFF)
+    script.be(modes.TAKEOFF)
+    script.autopilot.landed = LandedState.IN_AIR
+    script.speed = 1.5
+    script.run(159.0)
+    assert script.sequence.ending is None
+    script.run(2.0)
+    assert script.sequence.ending is not None
+    assert "within 160 s" in script.sequence.ending[1]
+
+
+def test_landing_as_the_take_off_ends_by_itself() -> None:
+    script = Script(landed=LandedState.ON_GROUND, armed=False)
+    script.until(lambda: script.sequence.phase is Phase.TAKEOFF)
+    script.autopilot.armed, script.autopilot.landed = True, LandedState.IN_AIR
+    script.be(modes.TAKEOFF)
+    script.run(1.0)
+    script.ops.at_once = False
+    script.sequence.land_from_here(script.now_s)
+    script.run(0.02)
+    script.be(modes.HOLD)
+    script.run(1.0)
+    assert script.sequence.phase is Phase.LAND
+    script.ops.asked[-1].end(Result.ACCEPTED, script.now_s)
+    script.be(modes.LAND)
+    script.run(1.0)
+    script.autopilot.armed, script.autopilot.landed = False, LandedState.ON_GROUND
+    script.run(0.1)
+    assert script.ends().detail == "landed and disarmed"
