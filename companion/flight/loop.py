@@ -93,7 +93,9 @@ class FlightLoop:
         system: the vehicle's system id, where it is known already.
         host: the program around it.
         paced: called once when it is known whether the vehicle waits for us (lockstep), with that.
-        engaged: called when the controller takes over, and again after its course's pace was changed; must not block.
+        engaged: called when the controller takes over, again after its course's pace or the law's parameters were
+            changed, and with the delays of the whole flight at the end; must not block.
+        delayed: called with the delays that were predicted over since the last time; must not block.
         only_gates: nothing is flown: it ends when the gates have judged.
     """
 
@@ -111,6 +113,7 @@ class FlightLoop:
         system: int | None = None,
         host: Host | None = None,
         engaged: Callable[[Engagement], None] = lambda engagement: None,
+        delayed: Callable[[list[tuple[float, float]]], None] = lambda delays: None,
         only_gates: bool = False,
         paced: Callable[[bool], None] = lambda waits: None,
     ) -> None:
@@ -125,6 +128,7 @@ class FlightLoop:
         self._system = system
         self._host: Host = Alone() if host is None else host
         self._engaged = engaged
+        self._delayed = delayed
         self._only_gates = only_gates
         self._paced = paced
         self._autopilot = Autopilot()
@@ -152,6 +156,7 @@ class FlightLoop:
         self._coasted = False
         self._unaccounted: FlownStep | None = None
         self._engagement: Engagement | None = None
+        self._delays_told = 0
         self._sent_ns = 0
         self._asked_ns: int | None = None
         """The vehicle's time when it last asked for our answer in lockstep [ns]; None elsewhere."""
@@ -174,7 +179,17 @@ class FlightLoop:
 
     def retune(self, change: ParameterChange) -> str:
         """Takes a change of the parameters; returns "" or why it cannot be followed."""
-        return "" if self._retuning is None else self._retuning.want(change)
+        if self._retuning is None:
+            return ""
+        if self.phase in {Phase.CONNECT, Phase.PREFLIGHT}:  # the loop is measured, and may ask for other gains
+            return "the flight is being prepared; try again in a moment"
+        if self._adaptation is not None:
+            # The ground judges a change over the loop of the vehicle file, and these gains were judged over another.
+            return (
+                f"this flight has {self._adaptation.gains_share:.0%} of the gains, certified for a loop that is worse"
+                " than the vehicle file says; nothing of them changes in it"
+            )
+        return self._retuning.want(change)
 
     @property
     def phase(self) -> Phase:
@@ -222,7 +237,7 @@ class FlightLoop:
             return Outcome(cause, detail, [], 0, {}, fault)
         rejected = {reason.name: n for reason, n in self._telemetry.rejected.items() if n}
         read = dict(self._autopilot.parameters)
-        self._keep_ramps()
+        self._keep_changes(ended=True)
         figures = self._watch.delay_figures() if self._engagement is not None else {}
         return Outcome(
             *(cause, detail, self._sequence.changes, self._lost, rejected, fault, read, self._engagement, figures),
@@ -541,17 +556,25 @@ class FlightLoop:
         self._engagement = Engagement(begin_s, *where, state.q, thrust_n, adaptation=self._adaptation)
         self._engaged(self._engagement)
 
-    def _keep_ramps(self) -> None:
-        """Notes and tells how the course's pace and the law's parameters were changed."""
+    def _keep_changes(self, *, ended: bool = False) -> None:
+        """Notes and tells how the course's pace, the law's parameters and the delay were changed.
+
+        Delays become thousands in a long flight: on the way only the new ones are told.
+        """
         engagement, course = self._engagement, self._sequence.course
         if engagement is None or course is None:
             return
         law = self._tracker if isinstance(self._tracker, Tracker) else None
-        ways, delays = ((), ()) if law is None else (tuple(law.transitions), tuple(law.delays))
+        ways, delays = ((), []) if law is None else (tuple(law.transitions), law.delays)
         resets = tuple(self._watch.resets.carried)
-        before = engagement.ramps, len(engagement.transitions), len(engagement.resets), len(engagement.delays)
-        if before != (course.ramps, len(ways), len(resets), len(delays)):
-            self._engagement = replace(engagement, ramps=course.ramps, transitions=ways, resets=resets, delays=delays)
+        new = delays[self._delays_told :]
+        if new:
+            self._delays_told = len(delays)
+            self._delayed(new)
+        before = engagement.ramps, len(engagement.transitions), len(engagement.resets)
+        if before != (course.ramps, len(ways), len(resets)) or (ended and delays):
+            known = tuple(delays) if ended else ()
+            self._engagement = replace(engagement, ramps=course.ramps, transitions=ways, resets=resets, delays=known)
             self._engaged(self._engagement)
 
     def _track(self, state: VehicleState, skipped: int, arrival_ns: int) -> None:
@@ -582,7 +605,7 @@ class FlightLoop:
         if finding is not None:
             respond(self._sequence, finding, self._last_state_s)
         if self._accounting.show(step, measured, self._sent_ns):
-            self._keep_ramps()
+            self._keep_changes()
 
     def _send(self, setpoint: Setpoint, state: VehicleState) -> bool:
         try:

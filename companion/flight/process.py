@@ -155,6 +155,7 @@ class Ready:
             host=host,
             paced=pace,
             engaged=lambda engagement: self.recorder.state("engagement", json.dumps(asdict(engagement))),
+            delayed=lambda delays: self.recorder.state("delays", json.dumps(delays)),
         )
 
     def note_outcome(self, outcome: Outcome) -> None:

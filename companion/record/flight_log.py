@@ -42,7 +42,7 @@ class Entry(IntEnum):
     TEXT = 17
     """A severity in one byte, and UTF-8."""
     FACT = 18
-    """A key, a zero byte, and what is known under it, as UTF-8: the last one of a key counts."""
+    """A key, a zero byte, and what is known under it, as UTF-8: the last one of a key counts, of "delays" all."""
 
 
 class FlightLog:

@@ -6,6 +6,7 @@ that has the flight's end gives the same one.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
@@ -272,7 +273,7 @@ def _summary(
         str(output.get("controller", "law")) if isinstance(output, Mapping) else "law",
     )
     summary = summarise(record, _phases(log, outcome), meta)
-    engagement = _json_object(log, "engagement") or None
+    engagement = _engagement(log)
     if outcome:
         read = outcome.get("parameters", {})
         note_end(summary, outcome, engagement, {name: read[name] for name in BASELINE_PARAMETERS if name in read})
@@ -282,6 +283,18 @@ def _summary(
     summary["ended"] = "the log ends before the flight's end"
     summary["verdict"] = "incomplete: the log ends before the flight's end"
     return summary
+
+
+def _engagement(log: LogFile) -> dict[str, Any] | None:
+    """The last engagement; of a flight whose end is missing, with the delays that were told on the way."""
+    engagement = _json_object(log, "engagement") or None
+    if engagement is not None and not engagement.get("delays"):
+        told: list[Any] = []
+        for text in log.long_info.get("delays", ()):
+            with contextlib.suppress(ValueError, TypeError):
+                told += json.loads(text)
+        engagement["delays"] = told
+    return engagement
 
 
 def _phases(log: LogFile, outcome: Mapping[str, Any]) -> list[PhaseChange]:

@@ -140,7 +140,10 @@ class Recorder:
         self.offer(Entry.TEXT, bytes((level,)) + text.encode("utf-8", "replace"), 0)
 
     def state(self, key: str, fact: str) -> None:
-        """Hand over what is known under a key from now on, for the log. Never blocks; the last one of a key counts."""
+        """Hand over what is known under a key from now on, for the log. Never blocks.
+
+        The last one of a key counts; of "delays" all of them, one after the other.
+        """
         self.offer(Entry.FACT, f"{key}\0{fact}".encode("utf-8", "replace"), 0)
 
     def give_way(self) -> None:

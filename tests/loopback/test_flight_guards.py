@@ -20,7 +20,8 @@ from flight_cases import (
 
 from companion.config import find
 from companion.flight.guards import Guard
-from companion.flight.phases import Cause
+from companion.flight.loop import FlightLoop
+from companion.flight.phases import Cause, Engagement
 from companion.frames import tilt_from_quat
 from sim_link import codec
 from sim_link.modes import Mode
@@ -39,13 +40,19 @@ def flight(hover_s: float = 3.0, **changes: Any):
     return make_flight(**{"vehicle": vehicle, "trajectory": trajectory, "statistics_from_s": 0.5} | changes)
 
 
-def fly(folder, *kinds: tuple[str, dict[str, Any]], prepare=lambda stand: None, **changes: Any) -> tuple[Stand, Flown]:
+def fly(
+    folder,
+    *kinds: tuple[str, dict[str, Any]],
+    prepare=lambda stand: None,
+    listen=lambda loop: None,
+    **changes: Any,
+) -> tuple[Stand, Flown]:
     """The flight, with faults that begin AT_S after OFFBOARD."""
     with Stand(flight(**changes), folder) as stand:
         for kind, keys in kinds:
             stand.after_offboard(AT_S, lambda kind=kind, keys=keys: stand.vehicle.faults.inject(kind, **keys))
         prepare(stand)
-        flown = stand.fly()
+        flown = stand.fly(listen)
     return stand, flown
 
 
@@ -320,7 +327,14 @@ def test_a_vehicle_that_is_disarmed_in_the_air_gets_no_setpoint_any_more(tmp_pat
 
 
 def test_the_delay_is_measured_and_used(tmp_path) -> None:
-    _, flown = fly(tmp_path, ("estimator_delay", {"delay_s": 0.006}), hover_s=7.0)
+    """What was followed is told on the way in pieces, each new delay once, and whole at the end."""
+    pieces: list[list[tuple[float, float]]] = []
+    engagements: list[Engagement] = []
+
+    def listen(loop: FlightLoop) -> None:
+        loop._delayed, loop._engaged = pieces.append, engagements.append  # type: ignore[method-assign]
+
+    _, flown = fly(tmp_path, ("estimator_delay", {"delay_s": 0.006}), hover_s=7.0, listen=listen)
     assert flown.cause is Cause.COMPLETED
     figures = flown.outcome.delay_s
     assert figures["file"] == 0.02
@@ -329,6 +343,8 @@ def test_the_delay_is_measured_and_used(tmp_path) -> None:
     first_s, first = flown.outcome.engagement.delays[0]
     assert first == pytest.approx(0.0202)
     assert first_s > flown.outcome.engagement.at_s + AT_S
+    assert len(pieces) > 2 and tuple(delay for piece in pieces for delay in piece) == flown.outcome.engagement.delays
+    assert [len(told.delays) for told in engagements] == [0, len(flown.outcome.engagement.delays)]
 
 
 def test_the_reference_slows_down_and_gets_its_pace_back(tmp_path) -> None:

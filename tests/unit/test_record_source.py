@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +152,14 @@ def test_a_folder_that_a_killed_flight_left_is_read_from_its_log(
     assert all(sentence.replace("'", "&#x27;") in text for sentence in source.missing)
     (row,) = table([tmp_path])
     assert row["verdict"].startswith("incomplete")
+
+
+def test_the_delays_of_a_killed_flight_are_put_together(tmp_path: Path, record: FlightRecord) -> None:
+    told = [[[105.0, 0.021], [106.0, 0.022]], [[107.5, 0.023]]]
+    log = logged(record, ended=False) + b"".join(ulog.long_info("delays", json.dumps(piece)) for piece in told)
+    source = read_source(written(tmp_path / "some.ulg", log))
+    engagement = Engagement.from_numbers(source.summary["engagement"])
+    assert engagement == replace(ENGAGEMENT, delays=((105.0, 0.021), (106.0, 0.022), (107.5, 0.023)))
 
 
 def test_the_folders_own_files_come_first(tmp_path: Path, record: FlightRecord, whole: bytes) -> None:

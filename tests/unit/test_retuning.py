@@ -14,11 +14,14 @@ from companion.control import flat
 from companion.control.types import State
 from companion.control.vectors import quat_normalise
 from companion.errors import InputError, RefusedError
+from companion.flight.adaptation import Adaptation
 from companion.flight.course import Course, at_rest
-from companion.flight.phases import Engagement
+from companion.flight.loop import FlightLoop
+from companion.flight.phases import Engagement, Phase
 from companion.flight.preflight import gate_gains
 from companion.flight.retuning import POINTS, ParameterChange, Retuning, Transition, between, flown, points, unsound
 from companion.flight.tracker import Tracker, kernels
+from companion.record.flight_record import FlightRecord
 from companion.trajectory.load import load, of_flight
 
 ZERO = (0.0, 0.0, 0.0)
@@ -323,3 +326,26 @@ def test_the_gates_in_brief_give_the_same_verdict(changes):
 
     vehicle = load_vehicle("bundled", changes)
     assert verdict(True) == verdict(False)
+
+
+class NoWire:
+    """A link on which nothing happens."""
+
+    system_id, component_id = 1, 191
+
+
+def test_a_flight_takes_changes_only_for_gains_that_the_ground_could_judge(monkeypatch):
+    """Not before the loop is measured, as that may ask for other gains; and not where it did."""
+    hover_ = {"name": "hover", "shape": "hover", "duration_s": 1.0, "hover": {"point_m": [0.0, 0.0, 0.0]}}
+    flight = build_flight({"name": "test", "vehicle": "bundled", "trajectory": hover_}, "test")
+    loop = FlightLoop(flight, of_flight(flight), NoWire(), FlightRecord(0, ()), kernels("python"))
+    change = ParameterChange({"heading_damping_1_s": 2.2})
+    assert loop.retune(change) == "the flight is being prepared; try again in a moment"
+    monkeypatch.setattr(FlightLoop, "phase", Phase.TRACK)
+    assert loop.retune(change) == ""
+    loop._adapt(Adaptation("rates", 0.7, 112.5, 0.034))
+    lowered = loop._tracker.parameters
+    assert loop.retune(change).startswith("this flight has 70% of the gains")
+    assert lowered.gains.k1 == pytest.approx(0.7 * flight.vehicle.parameters().gains.k1)
+    loop._retuning.tick()
+    assert not loop._tracker.changing and loop._tracker.parameters == lowered
