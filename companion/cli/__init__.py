@@ -6,8 +6,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import functools
 import importlib
+import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -18,6 +22,8 @@ from typer.core import TyperGroup
 
 from companion import __version__
 from companion.errors import CompanionError, ExitCode
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EIO}
 
 COMMANDS = {
     "demo": "Fly the paper's figure of eight on the bundled vehicle.",
@@ -102,16 +108,27 @@ def _root(
 
 
 def _interruptible(run: Callable[..., Any]) -> Callable[..., Any]:
-    """The command with Ctrl-C as exit code 130."""
+    """The command with Ctrl-C as exit code 130, and 141 where nobody reads what it says any more, as shells have it."""
 
     @functools.wraps(run)
     def guarded(*args: Any, **kwargs: Any) -> Any:
         try:
-            return run(*args, **kwargs)
+            done = run(*args, **kwargs)
+            sys.stdout.flush()  # here a failure can be told
+            return done
+        except BrokenPipeError:
+            _speak_into_nothing()
+            raise typer.Exit(128 + signal.SIGPIPE) from None
         except KeyboardInterrupt:
             raise typer.Exit(int(ExitCode.INTERRUPTED)) from None
 
     return guarded
+
+
+def _speak_into_nothing() -> None:
+    """What is still to be said would fail once more when the interpreter ends."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -131,7 +148,12 @@ def main(arguments: list[str] | None = None) -> int:
     except CompanionError as error:
         print(f"companion: {error}", file=sys.stderr)
         return int(error.exit_code)
-    except Exception:
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+            _speak_into_nothing()
+            where = f"{error.filename}: " if error.filename else "what this command says or writes: "
+            print(f"companion: {where}{error.strerror}; make room, or write elsewhere", file=sys.stderr)
+            return int(ExitCode.BAD_INPUT)
         traceback.print_exc()
         print("companion: this is a fault of the program; please report it with the lines above", file=sys.stderr)
         return int(ExitCode.INTERNAL)

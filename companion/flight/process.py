@@ -35,7 +35,7 @@ from companion.realtime import prepare, take_core_of_two, take_priority
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, write_summary
 from companion.record.recorder import Recorder
-from companion.record.summary import FlightMeta, note_end, summarise
+from companion.record.summary import FlightMeta, met, note_end, summarise
 from companion.record.ulog import ULOG_FILE, Level
 from companion.trajectory.anchored import Trajectory
 from companion.trajectory.load import of_flight
@@ -178,7 +178,8 @@ class Ready:
             return int(ExitCode.INTERNAL)
         if outcome.fault:
             print(outcome.fault, file=sys.stderr)
-        return _finish(self.folder, self.flight, self.trajectory, self.record, outcome, status)
+        whole = not self.recorder.problem
+        return _finish(self.folder, self.flight, self.trajectory, self.record, outcome, status, log_whole=whole)
 
 
 def fly(
@@ -230,7 +231,16 @@ def warm_up(flight: Any, compiled: Any) -> None:
         tracker.step(1.0 + i / flight.vehicle.link.state_rate_hz, state, lambda t: at_rest(zero, 0.0))
 
 
-def _finish(folder: Path, flight: Any, trajectory: Any, record: FlightRecord, outcome: Outcome, status: Status) -> int:
+def _finish(
+    folder: Path,
+    flight: Any,
+    trajectory: Any,
+    record: FlightRecord,
+    outcome: Outcome,
+    status: Status,
+    *,
+    log_whole: bool,
+) -> int:
     code = int(outcome.cause.value.exit_code)
     if outcome.phases:
         meta = FlightMeta(
@@ -246,15 +256,15 @@ def _finish(folder: Path, flight: Any, trajectory: Any, record: FlightRecord, ou
         read = outcome.parameters
         px4_parameters = {name: read[name] for name in BASELINE_PARAMETERS if name in read}
         note_end(summary, outcome.told(), engagement, px4_parameters)
-        if outcome.cause is Cause.COMPLETED and summary["verdict"] != "passed":
+        if outcome.cause is Cause.COMPLETED and not met(summary["verdict"]):
             code = int(ExitCode.MISSED)
-        if not _written(folder, record, summary, status):
+        if not _written(folder, record, summary, status, log_whole=log_whole):
             status.line(f"verdict: {summary['verdict']}")
     status.send(outcome=outcome.sentence, cause=outcome.cause.name)
     return code
 
 
-def _written(folder: Path, record: FlightRecord, summary: dict[str, Any], status: Status) -> bool:
+def _written(folder: Path, record: FlightRecord, summary: dict[str, Any], status: Status, *, log_whole: bool) -> bool:
     """Whether record and summary are on the disk; one that did not take them is no fault of the program, and said."""
     parts: dict[str, Callable[[], object]] = {
         RECORD_FILE: lambda: record.save(folder),
@@ -266,7 +276,8 @@ def _written(folder: Path, record: FlightRecord, summary: dict[str, Any], status
             write()
         except OSError as error:
             done = False
-            status.line(f"{folder / name}: cannot be written ({error.strerror}); {ULOG_FILE} holds the flight so far")
+            left = f"; {ULOG_FILE} holds the flight so far" if log_whole else ""
+            status.line(f"{folder / name}: cannot be written ({error.strerror}){left}")
             with contextlib.suppress(OSError):
                 (folder / f".{name}.part").unlink(missing_ok=True)
     return done

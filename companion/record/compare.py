@@ -13,7 +13,7 @@ from companion.record.flight_source import FlightSource, read_source_summary
 from companion.record.folder import write_whole
 from companion.record.page import compose
 from companion.record.report import flight_name, notes, read_flight, section
-from companion.record.summary import PASSED
+from companion.record.summary import met
 
 COMPARE_FILE: Final = "compare.html"
 
@@ -104,7 +104,7 @@ def build_comparison(first: Path, second: Path, out: Path | None = None) -> Path
         if keys:
             sections.append(section(figure.title, figure.caption, keys, figure.height_px))
     _share_ranges(drawn)
-    passed = [str(flight.summary.get("verdict")) == PASSED for flight, _ in flights]
+    passed = [met(flight.summary.get("verdict")) for flight, _ in flights]
     parts = {
         "TITLE": " and ".join(html.escape(name) for name in names),
         "SUBTITLE": "two flights side by side; time zooms in all figures together",

@@ -77,8 +77,15 @@ def read_source(path: Path) -> FlightSource:
         absent = " and ".join(name for name in (RECORD_FILE, SUMMARY_FILE) if not (path / name).exists())
         told = f"{absent}: not there, the control process did not come to its end; this is read from {ULOG_FILE}"
         return replace(source, path=path, truth=_read_truth(path / TRUTH_FILE), missing=(told, *source.missing))
+    try:
+        record = FlightRecord.load(path)
+    except InputError as error:
+        if not (path / ULOG_FILE).is_file():
+            raise
+        source = _from_log(path / ULOG_FILE)
+        told = f"{error}; this is read from {ULOG_FILE}"
+        return replace(source, path=path, truth=_read_truth(path / TRUTH_FILE), missing=(told, *source.missing))
     configuration = path / CONFIGURATION_FILE
-    record = FlightRecord.load(path)
     missing: tuple[str, ...] = ()
     battery: dict[str, Array] = {}
     messages: tuple[Message, ...] = ()

@@ -121,6 +121,10 @@ def _toml_value(value: object) -> object:
 def write_whole(path: Path, text: str) -> Path:
     """Write beside the file and move it there, so that nobody ever reads half of it."""
     unfinished = path.with_name(f".{path.name}.part")
-    unfinished.write_text(text, encoding="utf-8")
-    os.replace(unfinished, path)
+    try:
+        unfinished.write_text(text, encoding="utf-8")
+        os.replace(unfinished, path)
+    except OSError:
+        unfinished.unlink(missing_ok=True)
+        raise
     return path

@@ -19,7 +19,7 @@ from companion.record.flight_record import FlightRecord
 from companion.record.flight_source import FlightSource, read_source
 from companion.record.folder import write_whole
 from companion.record.page import compose
-from companion.record.summary import PASSED
+from companion.record.summary import met
 from companion.record.ulog import Level
 
 REPORT_FILE: Final = "report.html"
@@ -133,7 +133,7 @@ def _page(name: str, flight: FlightData, configuration: Mapping[str, Any]) -> st
         "TITLE": html.escape(name),
         "SUBTITLE": _subtitle(flight.summary),
         "VERDICT": html.escape(verdict),
-        "VERDICT_CLASS": "passed" if verdict == PASSED else "missed",
+        "VERDICT_CLASS": "passed" if met(verdict) else "missed",
         "THRESHOLDS": notes(flight.missing) + _thresholds(flight.summary, _merged(configuration, "acceptance")),
         "TILES": _tiles(flight.summary),
         "FIGURES": sections,

@@ -47,6 +47,7 @@ ACCEPTANCE_KEYS: Final = (
 PASSED: Final = "passed"
 NOT_SETTLED: Final = "not settled"
 DID_NOT_TRACK: Final = "did not track"
+_TOO_SHORT: Final = "flown, too short for statistics"
 COMPLETED: Final = "COMPLETED"
 """The cause of an end as planned."""
 
@@ -248,6 +249,8 @@ def _verdict(summary: Mapping[str, Any], acceptance: Mapping[str, float]) -> str
         return DID_NOT_TRACK
     if summary["settled_at_s"] is None:
         return NOT_SETTLED
+    if summary["position_max_m"] is None and not acceptance:
+        return f"{_TOO_SHORT}, which begin at {summary['statistics_from_s']:.4g} s"
     if summary["position_max_m"] is None:
         return f"missed: the track ended before the statistics began at {summary['statistics_from_s']:.4g} s"
     missed = []
@@ -260,6 +263,11 @@ def _verdict(summary: Mapping[str, Any], acceptance: Mapping[str, float]) -> str
             digits = next((digits for digits in (3, 4, 6) if f"{value:.{digits}g}" != f"{most:.{digits}g}"), 17)
             missed.append(f"{key} {value:.{digits}g} > {most:.6g}")
     return f"missed: {', '.join(missed)}" if missed else PASSED
+
+
+def met(verdict: object) -> bool:
+    """Whether this verdict is one of a flight that missed nothing which was asked of it."""
+    return verdict == PASSED or str(verdict).startswith(_TOO_SHORT)
 
 
 def _errors(record: FlightRecord) -> Array:

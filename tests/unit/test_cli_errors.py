@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -223,3 +227,24 @@ def test_a_connection_that_is_none(
     error = capfd.readouterr().err.splitlines()[-1]
     assert words in error
     assert connection in error
+
+
+CERTIFY = [sys.executable, "-m", "companion", "certify", "paper"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk that is always full")
+def test_a_full_disk_behind_the_output_is_said_in_one_line() -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(CERTIFY, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert done.stderr == (
+        "companion: what this command says or writes: No space left on device; make room, or write elsewhere\n"
+    )
+
+
+def test_a_reader_that_has_gone_is_no_miss_and_no_fault() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as gone:
+        done = subprocess.run(CERTIFY, stdout=gone, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")

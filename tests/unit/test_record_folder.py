@@ -10,7 +10,7 @@ import pytest
 
 from companion.cli import main
 from companion.errors import ExitCode, InputError
-from companion.record.folder import create_flight_folder, read_summary, write_configuration, write_summary
+from companion.record.folder import create_flight_folder, read_summary, write_configuration, write_summary, write_whole
 
 STARTED = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
@@ -120,3 +120,10 @@ def test_the_bundled_configuration_survives(tmp_path, name):
     for path in (Path(__file__).parents[2] / "config" / name).glob("*.toml"):
         table = tomllib.loads(path.read_text(encoding="utf-8"))
         assert tomllib.loads(write_configuration(tmp_path, table).read_text(encoding="utf-8")) == table
+
+
+def test_nothing_is_left_of_a_file_that_could_not_be_written(tmp_path):
+    (tmp_path / "page.html").mkdir()
+    with pytest.raises(IsADirectoryError):
+        write_whole(tmp_path / "page.html", "text")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]

@@ -154,6 +154,19 @@ def test_a_folder_that_a_killed_flight_left_is_read_from_its_log(
     assert row["verdict"].startswith("incomplete")
 
 
+def test_a_record_that_is_cut_off_is_read_from_the_log(tmp_path: Path, record: FlightRecord, whole: bytes) -> None:
+    record.save(tmp_path)
+    path = tmp_path / "record.npz"
+    path.write_bytes(path.read_bytes()[:50_000])
+    write_summary(tmp_path, {"verdict": "passed"})
+    with pytest.raises(InputError, match="cut off"):
+        read_source(tmp_path)
+    written(tmp_path / "flight.ulg", whole)
+    source = read_source(tmp_path)
+    assert source.record.rows.tobytes() == record.rows.tobytes()
+    assert "record.npz" in source.missing[0] and "this is read from flight.ulg" in source.missing[0]
+
+
 def test_the_delays_of_a_killed_flight_are_put_together(tmp_path: Path, record: FlightRecord) -> None:
     told = [[[105.0, 0.021], [106.0, 0.022]], [[107.5, 0.023]]]
     log = logged(record, ended=False) + b"".join(ulog.long_info("delays", json.dumps(piece)) for piece in told)

@@ -8,7 +8,7 @@ from record_cases import HOLD, PHASES, TRACK, row, synthetic_flight, track_recor
 
 from companion.errors import InputError
 from companion.record.flight_record import FlightRecord
-from companion.record.summary import FlightMeta, PhaseChange, check_acceptance, summarise, without_wall_clock
+from companion.record.summary import FlightMeta, PhaseChange, check_acceptance, met, summarise, without_wall_clock
 
 KEYS = [
     *("trajectory", "vehicle", "controller", "duration_s", "steps", "control_rate_hz"),
@@ -80,6 +80,13 @@ def test_a_track_too_short_for_statistics_is_a_miss():
     summary = summarise(distances(1.0, 0.1, 0.1), [], meta(acceptance={"position_rms_m": 1.0}))
     assert summary["position_rms_m"] is None
     assert summary["verdict"] == "missed: the track ended before the statistics began at 11 s"
+
+
+def test_a_short_track_of_which_nothing_was_asked_missed_nothing():
+    verdict = summarise(distances(1.0, 0.1, 0.1), [], meta())["verdict"]
+    assert verdict == "flown, too short for statistics, which begin at 11 s"
+    assert met(verdict) and met("passed")
+    assert not any(map(met, ("not settled", "did not track", "missed: everything", "ended early: x", "unknown", None)))
 
 
 def test_heading_is_null_when_it_is_free_and_skips_steps_without_one():
