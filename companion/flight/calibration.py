@@ -134,7 +134,12 @@ class Calibrator:
         if since_s < 0.0:
             return None, 0.0
         if not self._running:
-            if since_s > 2.0 * self._interval_s or not self._may_begin(slot, state, reference):
+            late = since_s > 2.0 * self._interval_s
+            if late:
+                self._notify(
+                    f"{slot.manoeuvre.told}: left out, for {since_s * 1e3:.0f} ms no state came to begin it by"
+                )
+            if late or not self._may_begin(slot, state, reference):
                 self._at += 1
                 return None, 0.0
             self._running = True

@@ -152,11 +152,13 @@ class Guards:
         """Whether the error was within the bound of the law once: a start from afar is not behind."""
         self._tilt_cosine = math.cos(vehicle.limits.tilt_max_rad)
         self._envelope: Envelope | None = None
+        self._p_max, self._ball = vehicle.controller.position_error_max_m, vehicle.limits.disturbance_max_m_s2
         if parameters is not None:
             self.retune(parameters)
 
     def retune(self, parameters: Parameters) -> None:
         """Other gains are flown from now on."""
+        self._p_max, self._ball = parameters.gains.p_max, parameters.limits.disturbance_max
         self._envelope = Envelope(parameters.gains, parameters.model.drag, disturbance_step(self._limits))
 
     def restart(self) -> None:
@@ -195,7 +197,7 @@ class Guards:
         if broken or Guard.FOLLOWING in self._since:
             limit = limits.rate_error_max_rad_s
             found = _harder(found, self._judge(Guard.FOLLOWING, broken, rate_error, limit, "rad/s", now_s))
-        bound = self._vehicle.controller.position_error_max_m
+        bound = self._p_max
         self._near = self._near or size < bound
         if flags or size > bound or self._since:
             found = _harder(found, self._strained(flags, size, numbers, now_s))
@@ -220,12 +222,12 @@ class Guards:
 
     def _strained(self, flags: int, size: float, numbers: tuple[float, ...], now_s: float) -> Finding | None:
         """Saturation, and an error beyond what the law reacts to."""
-        limits, bound = self._limits, self._vehicle.controller.position_error_max_m
+        limits, bound = self._limits, self._p_max
         behind = self._envelope is not None and self._near and size > bound  # the bound is the law's
         found = self._judge(Guard.BEHIND, behind, size, bound, "m", now_s)
         disturbance = math.hypot(*numbers[flat.B_HAT])
         for guard, mask, value, limit, unit in (
-            (Guard.DISTURBANCE, LIMIT_DISTURBANCE, disturbance, limits.disturbance_max_m_s2, "m/s^2"),
+            (Guard.DISTURBANCE, LIMIT_DISTURBANCE, disturbance, self._ball, "m/s^2"),
             (Guard.THRUST, _THRUST, numbers[flat.THRUST], limits.thrust_max_n, "N"),
             (Guard.RATES, _RATES, max(map(abs, numbers[flat.RATES])), max(limits.rate_max_rad_s), "rad/s"),
         ):

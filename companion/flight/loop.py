@@ -627,7 +627,8 @@ class FlightLoop:
             self._send(PositionSetpoint(None, (0.0, 0.0, 0.0), None, None, None), state)
             return
         hover = self._tracker.hover_share if isinstance(self._tracker, Calibrator) else None
-        self._send(coast_setpoint(self._flight, state.q, hover), state)
+        scale = self._tracker.thrust_scale if isinstance(self._tracker, Tracker) else None
+        self._send(coast_setpoint(self._flight, state.q, hover, scale), state)
 
 
 __all__ = ["FlightLoop", "Progress"]

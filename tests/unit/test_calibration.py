@@ -107,6 +107,20 @@ def test_no_manoeuvre_begins_while_the_vehicle_is_not_at_rest_and_a_large_tilt_e
 # ---- the fits --------------------------------------------------------------------------------------------------------
 
 
+def test_a_manoeuvre_for_whose_beginning_no_state_came_is_named() -> None:
+    from companion.flight.calibration import Calibrator
+    from companion.flight.phases import Autopilot
+
+    told: list[str] = []
+    calibrator = Calibrator(calibration_flight(SHORT), Autopilot(), told.append)
+    still = State(ZERO, ZERO, LEVEL, ZERO)
+    calibrator.begin(still)
+    begin_s = plan(CalibrationFlight(**SHORT))[0].begin_s
+    for t in (0.0, 0.01, begin_s - 0.01, begin_s + 0.2):
+        calibrator.step(t, still, lambda t: at_rest(ZERO, 0.0))
+    assert len(told) == 1 and "left out, for 200 ms no state came to begin it by" in told[0]
+
+
 def test_a_held_command_is_averaged_over_its_time() -> None:
     command = Held(np.array([0.0, 1.0, 3.0]), np.array([2.0, 4.0, 8.0]))
     assert command.means(np.array([-1.0, 0.0, 0.5, 1.5, 4.0, 9.0])) == pytest.approx([2.0, 2.0, 3.0, 5.6, 8.0])

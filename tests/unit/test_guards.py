@@ -129,6 +129,20 @@ def test_short_saturation_and_a_start_from_afar_are_nothing() -> None:
     assert watched.steps(3.0, error=(1.0, 0.0, 0.0)) == [(pytest.approx(0.5, abs=0.011), Guard.BEHIND, Response.SLOW)]
 
 
+def test_what_was_retuned_is_what_the_bounds_of_the_law_are_judged_by() -> None:
+    watched = Watched()
+    gains = PARAMETERS.gains._replace(p_max=2.0)
+    watched.guards.retune(PARAMETERS._replace(gains=gains, limits=PARAMETERS.limits._replace(disturbance_max=1.5)))
+    watched.steps(0.02)
+    assert watched.steps(3.0, error=(1.9, 0.0, 0.0)) == []
+    assert [guard for _, guard, _ in watched.steps(3.0, error=(2.1, 0.0, 0.0))] == [Guard.BEHIND]
+    found = []
+    for _ in range(round(2.2 / STEP_S)):
+        found.append(watched.guards.step(LEVEL, (0.0, 0.0, 0.0), numbers(LIMIT_DISTURBANCE, 1.5), watched.now_s))
+        watched.now_s += STEP_S
+    assert ["limit 1.5 m/s^2" in finding.detail for finding in found if finding is not None] == [True]
+
+
 def test_the_pace_comes_back_when_nothing_is_wrong_any_more() -> None:
     watched = Watched()
     watched.steps(1.0, n=numbers(LIMIT_THRUST_MAX))

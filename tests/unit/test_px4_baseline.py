@@ -11,7 +11,7 @@ from record_cases import PHASES, synthetic_flight, track_record
 from companion.config import load_flight, load_vehicle
 from companion.control import flat
 from companion.control.output import PositionSetpoint
-from companion.control.types import Reference, State
+from companion.control.types import GRAVITY_M_S2, Reference, State
 from companion.errors import RefusedError
 from companion.flight.baseline import Px4Baseline
 from companion.flight.coast import coast_setpoint
@@ -198,6 +198,21 @@ def test_without_a_state_it_is_told_to_stop():
     data = payload(setpoint)
     assert struct.unpack_from("<H", data, 48) == (0b110111000111,)
     assert data[4:48] == bytes(44)
+
+
+def test_without_a_state_the_law_coasts_with_the_thrust_as_it_was_found_to_be():
+    flight = flight_of("law")
+    by_file = coast_setpoint(flight, quat_from_yaw(0.3))
+    weaker = coast_setpoint(flight, quat_from_yaw(0.3), thrust_scale=0.8)
+    curve, full_n = flight.vehicle.rotors.curve_factor, flight.vehicle.thrust_full_n
+
+    def lift_n(setpoint):
+        return full_n * (curve * setpoint.thrust**2 + (1.0 - curve) * setpoint.thrust)
+
+    weight_n = flight.vehicle.body.mass_kg * GRAVITY_M_S2
+    assert lift_n(by_file) == pytest.approx(weight_n)
+    assert 0.8 * lift_n(weaker) == pytest.approx(weight_n)
+    assert weaker.q == by_file.q == pytest.approx(quat_from_yaw(0.3))
 
 
 def test_gates_of_the_gains_are_the_laws_alone(tmp_path):
