@@ -140,7 +140,7 @@ def test_what_was_retuned_is_what_the_bounds_of_the_law_are_judged_by() -> None:
     for _ in range(round(2.2 / STEP_S)):
         found.append(watched.guards.step(LEVEL, (0.0, 0.0, 0.0), numbers(LIMIT_DISTURBANCE, 1.5), watched.now_s))
         watched.now_s += STEP_S
-    assert ["limit 1.5 m/s^2" in finding.detail for finding in found if finding is not None] == [True]
+    assert ["limit 1.5 (limits.disturbance_max" in finding.detail for finding in found if finding is not None] == [True]
 
 
 def test_the_pace_comes_back_when_nothing_is_wrong_any_more() -> None:
