@@ -11,9 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-import tomlkit
-
 from companion.errors import InputError
+from companion.toml_text import toml_text
 
 FLIGHTS_FOLDER: Final = Path("flights")
 """Where flights go unless told otherwise, relative to the folder from which the command is called."""
@@ -100,7 +99,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 def write_configuration(folder: Path, configuration: Mapping[str, object]) -> Path:
     """Write `flight.toml`: all configuration as it was used. TOML knows no None: such entries are left out."""
-    return write_whole(folder / CONFIGURATION_FILE, tomlkit.dumps(_without_none(configuration)))
+    return write_whole(folder / CONFIGURATION_FILE, toml_text(_without_none(configuration)))
 
 
 def _without_none(table: Mapping[str, object]) -> dict[str, object]:

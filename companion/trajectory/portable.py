@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import tomlkit
-
 from companion.config import find
 from companion.frames import Frame
+from companion.toml_text import toml_text
 from companion.trajectory.formats.reading import decoded, read_bytes, shown
 from companion.trajectory.load import changed, table_of
 
@@ -44,4 +43,4 @@ class Portable:
             called = shown(str(other))
             table["text"] = decoded(read_bytes(other, called), called).text
         self.file_name = path.with_suffix(".toml").name
-        self.content = tomlkit.dumps(table).encode()
+        self.content = toml_text(table).encode()
