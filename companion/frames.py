@@ -75,6 +75,11 @@ def yaw_ned_from(frame: Frame, yaw_rad: float) -> float:
     return -yaw_rad if frame == "nwu" else yaw_rad
 
 
+def compass_deg(yaw_rad: float, digits: int = 6) -> float:
+    """A heading as a compass shows it: degrees clockwise from north, from 0 to below 360, rounded to so many digits."""
+    return round(math.degrees(yaw_rad) % 360.0, digits) % 360.0
+
+
 def ned_from_geo(point: GeoPoint, origin: GeoPoint) -> Vec3:
     """Where a point lies from another one, NED [m]: PX4's azimuthal equidistant projection on a sphere around `origin`.
 

@@ -159,7 +159,7 @@ def _check(
         fence=fence,
         height_min_m=height_min,
     )
-    document = _document(inspection, hold)
+    document = _document(inspection, hold, vehicle.controller.heading)
     problems: list[dict[str, Any]] = document["problems"]
     problems += gains
     if not any(problem["name"] in {"not_finite", "join"} for problem in problems):
@@ -181,8 +181,14 @@ def _predicted(flight: Any, trajectory: Trajectory) -> dict[str, Any]:
     return {"over_s": PREDICTED_S, **figures}
 
 
-def _document(inspection: Inspection, hold: Start) -> dict[str, Any]:
-    """What was found, as JSON has it."""
+def _document(inspection: Inspection, hold: Start, heading: str) -> dict[str, Any]:
+    """What was found, as JSON has it.
+
+    Args:
+        inspection: what was found.
+        hold: where the vehicle holds before.
+        heading: what it does with its nose: of the vehicle file's [controller].
+    """
     trajectory = inspection.trajectory
     steps = inspection.snap_steps
     peaks = {peak.name: _plain(peak) for peak in inspection.peaks}
@@ -200,12 +206,24 @@ def _document(inspection: Inspection, hold: Start) -> dict[str, Any]:
             name: None if end is None else {**_plain(end), "step": _plain(end.step)}
             for name, end in (("start", inspection.start), ("end", inspection.end))
         },
+        "heading": _headings(inspection, heading),
         "height_above_home": _plain(inspection.ground),
         "fence_margin": _plain(inspection.fence),
         "predicted": None,
         "time_scale_that_passes": inspection.time_scale,
         "problems": [_plain(problem) for problem in inspection.problems],
     }
+
+
+def _headings(inspection: Inspection, kind: str) -> dict[str, Any] | None:
+    """Where the reference's nose points at its ends, as a compass shows it, and whether the vehicle follows it."""
+    from companion.frames import compass_deg
+
+    if inspection.start is None:
+        return None
+    path = inspection.path
+    ends = {"start_deg": compass_deg(path.at(0.0).yaw), "end_deg": compass_deg(path.at(path.duration_s).yaw)}
+    return {**ends, "followed": kind == "commanded"}
 
 
 def _plain(value: Any) -> Any:

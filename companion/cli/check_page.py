@@ -77,6 +77,8 @@ def _remarks(inspection: Inspection, document: dict[str, Any]) -> list[str]:
     for name, end in (("start", inspection.start), ("end", inspection.end)):
         if end is not None:
             lines.append(f"{name}: {_end(end)}")
+    if document["heading"] is not None:
+        lines.append(_heading(document["heading"]))
     north, east, down = document["start"]["position_m"]
     lines.append(f"held before at ({north:.2f}, {east:.2f}, {down:.2f}) m from home, north, east, down (--start)")
     for name, margin in (("lowest above home", inspection.ground), ("nearest to the fence", inspection.fence)):
@@ -87,6 +89,12 @@ def _remarks(inspection: Inspection, document: dict[str, Any]) -> list[str]:
         "no time scale keeps the limits" if pace is None else f"the limits are kept up to a time scale of {pace:.3g}"
     )
     return lines
+
+
+def _heading(heading: dict[str, Any]) -> str:
+    start_deg, end_deg = (round(heading[key], 1) % 360.0 for key in ("start_deg", "end_deg"))
+    said = f"heading: {start_deg:g} deg at the start, {end_deg:g} deg at the end, clockwise from north"
+    return said if heading["followed"] else f"{said}; not followed: this vehicle chooses its own"
 
 
 def _end(end: End) -> str:

@@ -14,11 +14,13 @@ from format_cases import DATA, EIGHT, mavsdk, polynomial, rest_to_rest, skybrush
 from companion.campaign import predict
 from companion.cli import check, main
 from companion.cli.sketch import sketch
-from companion.config import load_vehicle
+from companion.config import Vehicle, load_vehicle
 from companion.control.types import Reference
 from companion.errors import RefusedError
 from companion.flight.inspection import inspect
 from companion.flight.surroundings import separation
+from companion.frames import compass_deg
+from companion.toml_text import toml_text
 from companion.trajectory import torque
 from companion.trajectory.anchored import Trajectory, anchored
 from companion.trajectory.flatness import PointMass
@@ -102,6 +104,13 @@ def test_the_torque_that_rotors_have_is_that_of_the_worst_direction() -> None:
     assert of.lever_m * moved == pytest.approx(2.0 * arm * math.sqrt(2.0) * moved)
 
 
+def commanded(vehicle: Vehicle) -> str:
+    """The file of a vehicle that follows the headings of its trajectory."""
+    table = vehicle.model_dump(mode="json", exclude_none=True)
+    table["controller"]["heading"] = "commanded"
+    return toml_text(table)
+
+
 def written(folder: Path, name: str, text: str) -> str:
     (folder / name).write_text(text)
     return str(folder / name)
@@ -168,6 +177,39 @@ def test_ground_and_start(capsys: pytest.CaptureFixture[str]) -> None:
     document(capsys, "lissajous", "--vehicle", "bundled", "--start", "0,0,-1,90", "--height-min", "-3")
     high = document(capsys, "lissajous", "--vehicle", "bundled")["files"][0]
     assert high["start"]["position_m"] == [0.0, 0.0, -5.0]
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_headings_at_both_ends_are_a_compass(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = "east,north,up,yaw_deg\n0,0,5,0\n0,10,5,135\n"
+    path = written(tmp_path, "wp.csv", text)
+    followed = written(tmp_path, "follows.toml", commanded(load_vehicle("bundled")))
+    found = document(capsys, path, "--vehicle", followed)["files"][0]
+    assert found["heading"] == {"start_deg": 90.0, "end_deg": 315.0, "followed": True}
+    note = "yaw_deg counts from east to north in this frame: the first point's 0 is a heading of 90 deg"
+    assert any(said.startswith(note) for said in found["notes"])
+    assert main(["check", path, "--vehicle", followed]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "  heading: 90 deg at the start, 315 deg at the end, clockwise from north" in lines
+    assert any(line.startswith(f"  {note}") for line in lines)
+
+
+@pytest.mark.usefixtures("quick")
+def test_headings_of_a_turned_file_and_a_vehicle_that_does_not_follow(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path, "wp.csv", "east,north,up,heading_deg\n0,0,5,350\n0,10,5,10\n")
+    path = written(tmp_path, "turned.toml", 'file = "wp.csv"\nanchor_yaw_deg = 9.99\n')
+    found = document(capsys, path, "--vehicle", "bundled")["files"][0]
+    assert found["heading"] == {"start_deg": pytest.approx(359.99), "end_deg": pytest.approx(19.99), "followed": False}
+    assert main(["check", path, "--vehicle", "bundled"]) == 0
+    said = "heading: 0 deg at the start, 20 deg at the end, clockwise from north"
+    assert f"  {said}; not followed: this vehicle chooses its own" in capsys.readouterr().out.splitlines()
+
+
+def test_a_compass_never_says_360() -> None:
+    degrees = (0.0, -1e-9, 359.9999999, 360.0, -90.0, 725.0)
+    assert [compass_deg(math.radians(x)) for x in degrees] == [0.0, 0.0, 0.0, 0.0, 270.0, 5.0]
 
 
 @pytest.mark.usefixtures("quick")

@@ -14,7 +14,7 @@ from companion.campaign import predict
 from companion.cli import main
 from companion.config import Flight, load_vehicle
 from companion.flight.surroundings import HEIGHT_MIN_M
-from companion.frames import FRAMES
+from companion.frames import FRAMES, compass_deg, radians, yaw_ned_from
 from companion.trajectory import earth
 from companion.trajectory.file_definition import WAYPOINTS_MAX, FileDefinition, LimitsTable, WaypointTable
 from companion.trajectory.formats import FORMATS, mission, reading, waypoint_csv
@@ -75,6 +75,24 @@ def test_every_format_and_frame_is_there() -> None:
     for entry in FORMATS:
         if entry.frame is None:
             assert re.search(rf"^\| `{entry.name}`.*to be declared", TEXT, re.M), entry.name
+
+
+def test_the_headings_of_frames_are_those() -> None:
+    rows = re.findall(r"^\| of `([a-z]+)` \| from (\w+) to (\w+) \| (\d+) deg \| (\d+) deg \|$", TEXT, re.M)
+    assert sorted(row[0] for row in rows) == sorted(FRAMES)
+    for frame, x, y, at_zero, at_ninety in rows:
+        assert FRAMES[frame].startswith(f"x {x}, y {y}, ")
+        found = [compass_deg(yaw_ned_from(frame, radians(yaw_deg))) for yaw_deg in (0.0, 90.0)]
+        assert found == [float(at_zero), float(at_ninety)]
+        assert waypoint_csv.TURNS.get(frame, "from north to east") == f"from {x} to {y}"
+
+
+def test_every_format_says_what_its_headings_are() -> None:
+    (section,) = re.findall(r"^### Headings\n(.*?)^### ", TEXT, re.M | re.S)
+    for entry in FORMATS:
+        assert f"`{entry.name}`" in section, entry.name
+    for column in waypoint_csv.EXTRAS:
+        assert f"`{column}`" in TEXT
 
 
 def test_the_limits_on_files_are_those() -> None:

@@ -239,6 +239,81 @@ def test_a_waypoint_table_with_names(tmp_path: Path, vehicle: Vehicle) -> None:
     assert trajectory.at(trajectory.duration_s).yaw == pytest.approx(math.pi, abs=1e-6)
 
 
+POINTS = {
+    # Two points, the second 10 m north of the first, in each frame.
+    "ned": ("x,y,z", "0,0,-5", "10,0,-5"),
+    "enu": ("x,y,z", "0,0,5", "0,10,5"),
+    "nwu": ("x,y,z", "0,0,5", "10,0,5"),
+}
+NAMED = {"ned": "north,east,down", "enu": "east,north,up", "nwu": "north,west,up"}
+
+
+def headed(folder: Path, frame: str, column: str, first: float, last: float, *, named: bool = False) -> Path:
+    """A waypoint file with a column of headings."""
+    axes, one, other = POINTS[frame]
+    path = folder / "wp.csv"
+    path.write_text(f"{NAMED[frame] if named else axes},{column}\n{one},{first}\n{other},{last}\n")
+    return path
+
+
+@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize(
+    ("frame", "turn", "first", "heading"),
+    [
+        ("enu", "from east to north", 0.0, 90.0),
+        ("enu", "from east to north", 90.0, 0.0),
+        ("enu", "from east to north", 12.5, 77.5),
+        ("nwu", "from north to west", 90.0, 270.0),
+        ("nwu", "from north to west", -30.0, 30.0),
+        ("ned", None, 90.0, 90.0),
+    ],
+)
+def test_yaw_turns_with_the_frame_and_a_note_says_so(
+    tmp_path: Path, vehicle: Vehicle, frame: Any, turn: str | None, first: float, heading: float, named: bool
+) -> None:
+    path = headed(tmp_path, frame, "yaw_deg", first, first + 10.0, named=named)
+    trajectory = load(path, vehicle=vehicle, frame=None if named else frame)
+    assert math.remainder(trajectory.at(0.0).yaw - math.radians(heading), math.tau) == pytest.approx(0.0, abs=1e-9)
+    notes = [note for note in trajectory.notes if "yaw_deg" in note]
+    if turn is None:
+        assert notes == []
+    else:
+        assert notes == [
+            f"yaw_deg counts {turn} in this frame: the first point's {first:g} is a heading of {heading:g} deg"
+            " (clockwise from north)"
+        ]
+
+
+@pytest.mark.parametrize("frame", ["ned", "enu", "nwu"])
+def test_a_heading_column_is_a_compass_in_every_frame(tmp_path: Path, vehicle: Vehicle, frame: Any) -> None:
+    trajectory = load(headed(tmp_path, frame, "heading_deg", 350, 80), vehicle=vehicle, frame=frame)
+    assert math.degrees(trajectory.at(0.0).yaw) % 360.0 == pytest.approx(350.0)
+    assert math.degrees(trajectory.at(trajectory.duration_s).yaw) % 360.0 == pytest.approx(80.0)
+    assert trajectory.at(0.5 * trajectory.duration_s).yaw_rate > 0.0  # clockwise, by north: the shorter turn
+    assert not any("yaw_deg" in note for note in trajectory.notes)
+
+
+def test_points_without_headings_have_no_note_of_them(tmp_path: Path, vehicle: Vehicle) -> None:
+    path = headed(tmp_path, "enu", "stop", 0, 0)
+    assert not any("yaw_deg" in note for note in load(path, vehicle=vehicle, frame="enu").notes)
+
+
+def test_two_columns_of_headings_are_refused(tmp_path: Path, vehicle: Vehicle) -> None:
+    path = tmp_path / "wp.csv"
+    path.write_text("# both\neast,north,up,yaw_deg,heading_deg\n0,0,5,0,90\n0,10,5,0,90\n")
+    with pytest.raises(InputError) as caught:
+        load(path, vehicle=vehicle)
+    assert str(caught.value) == (
+        f"{path}: line 2: has yaw_deg (from x towards y of its frame) and heading_deg (clockwise from north); keep one"
+        " of the columns"
+    )
+
+
+def test_a_heading_beyond_belief_is_refused(tmp_path: Path, vehicle: Vehicle) -> None:
+    with pytest.raises(InputError, match=r"line 2: heading_deg is 4000 deg, more than 3600 deg is not believed"):
+        load(headed(tmp_path, "enu", "heading_deg", 4000, 0), vehicle=vehicle, frame="enu")
+
+
 OURS = """
 shape = "waypoints"
 anchor = "local"
