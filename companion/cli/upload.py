@@ -2,13 +2,14 @@
 under that name stays then. An upload that was cut off goes on where it ended when it is made again.
 
 A file that names another program's goes as one that holds its text; so does another program's file with --frame or
---laps, as NAME.toml.
+--laps, as NAME.toml. What goes as TOML must have a name that ends in .toml there: by that the vehicle knows it.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -18,6 +19,7 @@ from companion.cli.operate import TO_DEFAULT, KeyOption, ToOption
 
 if TYPE_CHECKING:
     from companion.ground.upload import Verdict
+    from companion.trajectory.portable import Portable
 
 EXAMPLE = "Example: companion upload lap.csv --to udpout:192.168.1.10:14590"
 
@@ -52,6 +54,7 @@ def run(
     from companion.trajectory.portable import Portable
 
     brought = Portable(file, frame_named(frame), laps)
+    called = _name(brought, name)
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     with (
         Files(to, system=system, key=key) as files,
@@ -65,14 +68,29 @@ def run(
             else:
                 bar.update(task, completed=there, total=total)
 
-        verdict = files.upload_bytes(
-            brought.content, name or brought.file_name, progress=show, verdict_patience_s=timeout
-        )
+        verdict = files.upload_bytes(brought.content, called, progress=show, verdict_patience_s=timeout)
     if as_json:
         print(json.dumps(verdict._asdict(), indent=2))
     else:
         _say(verdict)
     raise typer.Exit(int(ExitCode.DONE if verdict.accepted else ExitCode.REFUSED))
+
+
+def _name(brought: Portable, wanted: str | None) -> str:
+    """What to call the file there; TOML under another name would be read as another program's file."""
+    from companion.errors import InputError
+    from companion.trajectory.formats import FORMATS
+    from companion.trajectory.formats.reading import shown
+
+    if not wanted:
+        return brought.file_name
+    suffix = PurePath(wanted).suffix
+    if suffix.lower() == ".toml" or PurePath(brought.file_name).suffix.lower() != ".toml":
+        return wanted
+    known = {entry for of in FORMATS for entry in of.suffixes}
+    better = (wanted.removesuffix(suffix) if suffix.lower() in known else wanted) + ".toml"
+    why = "with --frame or --laps the file goes as TOML" if brought.around else "the file is TOML"
+    raise InputError(f"--name {shown(wanted)}: {why}; name it {shown(better)}")
 
 
 def _say(verdict: Verdict) -> None:

@@ -31,6 +31,8 @@ class Portable:
         path = find(name, "trajectories")
         self.file_name = path.name
         """What to call it there."""
+        self.around = False
+        """Whether it was made around another program's file, because of `frame` or `laps`."""
         ours = path.suffix.lower() == ".toml"
         table = table_of(name, frame) if ours or frame is not None or laps is not None else {}
         if not ("file" in table or (ours and laps is not None)):
@@ -42,5 +44,6 @@ class Portable:
             table.pop("sha256", None)
             called = shown(str(other))
             table["text"] = decoded(read_bytes(other, called), called).text
+        self.around = not ours
         self.file_name = path.with_suffix(".toml").name
         self.content = toml_text(table).encode()

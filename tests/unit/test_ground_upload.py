@@ -260,6 +260,49 @@ def test_what_is_wrong_with_a_command(capsys, arguments, words):
     assert words in err and len(err.splitlines()) == 1 and out == ""
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["lap.csv", "--frame", "enu", "--name", "lap.csv"], "with --frame or --laps the file goes as TOML; lap.toml"),
+        (["lap.csv", "--laps", "2", "--name", "Lap.PLAN"], "with --frame or --laps the file goes as TOML; Lap.toml"),
+        (
+            ["lap.csv", "--laps", "2", "--name", "lap v1.2"],
+            "with --frame or --laps the file goes as TOML; lap v1.2.toml",
+        ),
+        (["around.toml", "--name", "lap.csv"], "the file is TOML; lap.toml"),
+        (["circle", "--name", "circle"], "the file is TOML; circle.toml"),
+        (["circle", "--laps", "2", "--name", "circle.txt"], "the file is TOML; circle.toml"),
+    ],
+)
+def test_toml_under_another_name_is_refused_before_it_is_sent(tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("companion.ground.upload.Wire.open", lambda *_, **__: pytest.fail("a link was opened"))
+    (tmp_path / "lap.csv").write_text("0,0,5\n5,0,5\n")
+    (tmp_path / "around.toml").write_text('file = "lap.csv"\nframe = "enu"\n')
+    assert main(["upload", *arguments]) == 2
+    why, _, better = words.partition("; ")
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", f"companion: --name {arguments[-1]}: {why}; name it {better}\n")
+
+
+def test_a_name_that_fits_is_taken(server, tmp_path, monkeypatch, capsys):
+    network = Network(server)
+    network.close = lambda: None
+    monkeypatch.setattr("companion.ground.upload.Wire.open", lambda *_, **__: network)
+    defaults = Files.__init__.__kwdefaults__
+    monkeypatch.setitem(defaults, "clock", network.clock)
+    monkeypatch.setitem(defaults, "sleep", network.sleep)
+    lap = tmp_path.parent / "lap.csv"
+    lap.write_text("0,0,5\n5,0,5\n")
+    for arguments in (
+        [str(lap), "--frame", "enu", "--name", "mine.toml"],
+        [str(lap), "--name", "anything"],
+        ["circle", "--name", "C.TOML"],
+    ):
+        assert main(["upload", *arguments, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["name"] == arguments[-1]
+
+
 def test_the_commands(server, tmp_path, monkeypatch, capsys):
     network = Network(server)
     network.close = lambda: None
