@@ -225,6 +225,41 @@ def test_fence_items_of_a_text_mission(tmp_path: Path) -> None:
     assert read_fence(tmp_path / "fence.waypoints").margins(points) == pytest.approx([20.0, -5.0], abs=0.01)
 
 
+def absolute(home: str) -> str:
+    """A text mission with altitudes above sea level, whose first waypoint is the current one."""
+    lines = ["QGC WPL 110", home] if home else ["QGC WPL 110"]
+    for index, (north, east, up) in enumerate(SQUARE, start=len(lines) - 1):
+        latitude, longitude = place(north, east)
+        current = int(len(lines) == 1)
+        lines.append(f"{index}\t{current}\t0\t16\t0\t0\t0\t0\t{latitude:.8f}\t{longitude:.8f}\t{500.0 + up:.6f}\t1")
+    return "\n".join(lines) + "\n"
+
+
+def test_what_is_taken_for_home_is_said(tmp_path: Path, vehicle: Vehicle) -> None:
+    path = tmp_path / "a.waypoints"
+    path.write_text(absolute(home=""))
+    note = "item 0 (47.39774, 8.54559, 510 m) is taken for the home position, not flown"
+    route = points_of(path)
+    assert route.notes[0] == note
+    assert len(route.legs) == len(SQUARE) - 1
+    assert note in load(path, vehicle=vehicle).notes
+    # With the line that is missing, or with a first waypoint that is not the current one, all points are flown.
+    path.write_text(absolute(home=f"0\t1\t0\t16\t0\t0\t0\t0\t{HOME[0]:.8f}\t{HOME[1]:.8f}\t488.25\t1"))
+    route = points_of(path)
+    assert route.notes[0] == "item 0 (47.39774, 8.54559, 488.25 m) is taken for the home position, not flown"
+    assert len(route.legs) == len(SQUARE)
+    path.write_text(absolute(home="").replace("0\t1\t0\t16", "0\t0\t0\t16", 1))
+    route = points_of(path)
+    assert not any("home position" in said for said in route.notes)
+    assert len(route.legs) == len(SQUARE)
+
+
+def test_the_home_of_a_ground_station_is_said_too() -> None:
+    assert points_of(DATA / "square.waypoints").notes[0] == (
+        "item 0 (47.39774, 8.54559, 488 m) is taken for the home position, not flown"
+    )
+
+
 def test_a_waypoint_table_with_names(tmp_path: Path, vehicle: Vehicle) -> None:
     (tmp_path / "a.csv").write_text(
         "north,east,down,yaw_deg,speed_m_s,stop\n0,0,-5,90,0,0\n10,0,-5,90,2.0,0\n20,0,-6,180,0,1\n20,10,-6,180,0,0\n"

@@ -1,11 +1,13 @@
 """Missions in the text format QGC WPL 110: index, current, frame, command, four parameters, x, y, z, autocontinue.
 
 Where the first item is absolute while it is also the current one, it is the home position, as ground stations write it.
+Nothing tells it from the first waypoint of an absolute mission without a home position: a note says how it is taken.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import isnan
 
 from companion.frames import Frame, GeoPoint
@@ -30,7 +32,11 @@ def matches(source: Source) -> bool:
 def read(source: Source, frame: Frame) -> Route:
     """Return the points of a mission, in north-east-down from its home. Raises InputError."""
     items, home = _items(source)
-    return route(source, items if home is None else items[1:], home, fence=fence_items(source, items))
+    if home is None:
+        return route(source, items, None, fence=fence_items(source, items))
+    found = route(source, items[1:], home, fence=fence_items(source, items))
+    where = f"{home.latitude_deg:.5f}, {home.longitude_deg:.5f}, {home.altitude_m:.6g} m"
+    return replace(found, notes=(f"item 0 ({where}) is taken for the home position, not flown", *found.notes))
 
 
 def read_fence(source: Source) -> Fence | None:
