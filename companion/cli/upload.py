@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.common import FrameOption, JsonOption, LapsOption, frame_named, say
+from companion.cli.common import FrameOption, JsonOption, LapsOption, frame_named, say, say_notes
 from companion.cli.operate import TO_DEFAULT, KeyOption, ToOption
 
 if TYPE_CHECKING:
@@ -55,6 +55,8 @@ def run(
 
     brought = Portable(file, frame_named(frame), laps)
     called = _name(brought, name)
+    notes = brought.notes()
+    say_notes(notes, quiet=as_json)
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     with (
         Files(to, system=system, key=key) as files,
@@ -70,7 +72,7 @@ def run(
 
         verdict = files.upload_bytes(brought.content, called, progress=show, verdict_patience_s=timeout)
     if as_json:
-        print(json.dumps(verdict._asdict(), indent=2))
+        print(json.dumps({**verdict._asdict(), "notes": list(notes)}, indent=2))
     else:
         _say(verdict)
     raise typer.Exit(int(ExitCode.DONE if verdict.accepted else ExitCode.REFUSED))

@@ -20,7 +20,7 @@ from companion.trajectory.anchored import Trajectory
 from companion.trajectory.definition import Definition
 from companion.trajectory.file_definition import FileDefinition, PlacedTable, WaypointsDefinition
 from companion.trajectory.files import Made, shape_of
-from companion.trajectory.formats import FORMATS
+from companion.trajectory.formats import FORMATS, parse
 from companion.trajectory.formats.reading import FILE_MAX_BYTES, Source, decoded, quoted, read_bytes, shown
 from companion.trajectory.laps import repeated
 from companion.trajectory.route import planned
@@ -121,6 +121,24 @@ def _from_file(
     text, suffix = _text_of(definition, source)
     made = shape_of(text, suffix, definition.options(vehicle))
     return _placed(definition, made, name, source, time_scale, vehicle)
+
+
+def reader_notes(data: Mapping[str, Any], source: str) -> tuple[str, ...]:
+    """Return what the reader of another program's file says about it, without making a path: that takes a vehicle.
+
+    Args:
+        data: the table of a trajectory file; one that names no other program's file has no such notes.
+        source: what to call the file in errors.
+
+    Raises:
+        InputError: the other program's file cannot be read.
+
+    """
+    if not {"file", "text"} & set(data):
+        return ()
+    definition = validate(FileDefinition, data, source)
+    text, suffix = _text_of(definition, source)
+    return parse(text, frame=definition.frame, name=definition.format, suffix=suffix).notes
 
 
 def _text_of(definition: FileDefinition, source: str) -> tuple[Source, str]:

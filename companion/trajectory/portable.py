@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from companion.config import find
+from companion.errors import InputError
 from companion.frames import Frame
 from companion.toml_text import toml_text
 from companion.trajectory.formats.reading import decoded, read_bytes, shown
-from companion.trajectory.load import changed, table_of
+from companion.trajectory.load import changed, reader_notes, table_of
 
 
 class Portable:
@@ -37,6 +39,7 @@ class Portable:
         table = table_of(name, frame) if ours or frame is not None or laps is not None else {}
         if not ("file" in table or (ours and laps is not None)):
             self.content = read_bytes(path, shown(str(path)))
+            self._table = table or {"file": str(path)}
             return
         table = changed(table, None, laps)
         if "file" in table:
@@ -47,3 +50,13 @@ class Portable:
         self.around = not ours
         self.file_name = path.with_suffix(".toml").name
         self.content = toml_text(table).encode()
+        self._table = table
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what the reader of another program's file says about it, a sentence each.
+
+        None where it cannot be read: what is wrong with it is the vehicle's to say, which may know more formats.
+        """
+        with suppress(InputError):
+            return reader_notes(self._table, self.file_name)
+        return ()

@@ -285,6 +285,25 @@ def test_toml_under_another_name_is_refused_before_it_is_sent(tmp_path, monkeypa
     assert (out, err) == ("", f"companion: --name {arguments[-1]}: {why}; name it {better}\n")
 
 
+def test_the_reader_s_notes_come_first(server, tmp_path, monkeypatch, capsys):
+    network = Network(server)
+    network.close = lambda: None
+    monkeypatch.setattr("companion.ground.upload.Wire.open", lambda *_, **__: network)
+    defaults = Files.__init__.__kwdefaults__
+    monkeypatch.setitem(defaults, "clock", network.clock)
+    monkeypatch.setitem(defaults, "sleep", network.sleep)
+    lap = tmp_path.parent / "lap.csv"
+    lap.write_text("east,north,up,yaw_deg\n0,0,5,0\n5,0,5,0\n")
+    assert main(["upload", str(lap)]) == 0
+    note, stored, _ = capsys.readouterr().out.splitlines()
+    assert note.startswith(
+        "  yaw_deg counts from east to north in this frame: the first point's 0 is a heading of 90 deg"
+    )
+    assert stored.startswith("lap.csv: stored with number 1")
+    assert main(["upload", str(lap), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == [note.strip()]
+
+
 def test_a_name_that_fits_is_taken(server, tmp_path, monkeypatch, capsys):
     network = Network(server)
     network.close = lambda: None

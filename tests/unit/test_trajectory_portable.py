@@ -62,6 +62,21 @@ def test_what_needs_nothing_goes_as_it_is(path: Path) -> None:
     assert (brought.file_name, brought.content) == (path.name, path.read_bytes())
 
 
+def test_what_the_reader_says_is_known_without_a_vehicle(tmp_path: Path) -> None:
+    (tmp_path / "wp.csv").write_text("x,y,z,yaw_deg\n0,0,5,0\n5,0,5,0\n")
+    (tmp_path / "around.toml").write_text('file = "wp.csv"\nframe = "nwu"\n')
+    (note,) = Portable(str(tmp_path / "wp.csv"), frame="enu", laps=2).notes()
+    assert note.startswith("yaw_deg counts from east to north in this frame")
+    around = Portable(str(tmp_path / "around.toml"))
+    (note,) = around.notes()
+    assert note.startswith("yaw_deg counts from north to west in this frame")
+    (tmp_path / "whole.toml").write_bytes(around.content)
+    assert Portable(str(tmp_path / "whole.toml")).notes() == (note,)
+    assert any("home position" in said for said in Portable(str(DATA / "square.waypoints")).notes())
+    assert Portable(str(tmp_path / "wp.csv")).notes() == ()  # without its frame it cannot be read
+    assert Portable("circle").notes() == ()
+
+
 def test_what_cannot_be_read_is_said_here(tmp_path: Path) -> None:
     (tmp_path / "trip.toml").write_text('file = "nothing.csv"\n')
     with pytest.raises(InputError, match=r"nothing\.csv: cannot be read"):
