@@ -79,7 +79,7 @@ def open_store(settings: Settings) -> TrajectoryStore:
     """The trajectories that may be started.
 
     Raises:
-        InputError: the folder cannot be used.
+        InputError: the folder cannot be used, or another `companion serve` uses it.
     """
     folder = Path(settings.trajectories)
     depends = crc32(json.dumps(settings.flight, sort_keys=True).encode())

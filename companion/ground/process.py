@@ -83,6 +83,8 @@ class Ground:
             port.greeting = self._reports.heartbeat
         tuning = tuning_of(settings)
         store = open_store(tuned(settings, tuning.overrides))
+        if store.problem:
+            report.line(f"{store.problem}: see that no other `companion serve` uses it")
         self._commands = CommandServer(self, Startable(store), self._reports, self._system)
         self._files = file_server(store, self._say_verdict)
         self._parameters = parameter_server(settings, tuning, self, self._say_verdict, self._system)

@@ -5,7 +5,7 @@ or refused leaves no half file, and the trajectory that had the name before stay
 waiting: a check runs apart (`examine`), and `update` takes in what came of it.
 
 Hidden files: `.part-NAME` is an upload that is under way, or was cut off and can be gone on with; `.check-N-NAME` is
-one that is being checked; `.catalogue.json` is what is known of the others.
+one that is being checked; `.catalogue.json` is what is known of the others; `.lock` keeps a second store out.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any, Final, NamedTuple
 from companion.ground.catalogue import Catalogue, Entry, file_crc32, sync_folder
 from companion.ground.checks import Checks, Job, Submission
 from companion.ground.examine import Examiner, Finding
+from companion.ground.folder_lock import FolderLock
 from companion.ground.names import StoreError, usable
 from companion.ground.staging import Upload
 
@@ -63,12 +64,14 @@ class TrajectoryStore:
             checked_by: what a verdict depends on beside the file; verdicts given under another one are given anew.
 
         Raises:
+            InputError: another process has it open.
             OSError: the folder cannot be made, read or written.
         """
         self.folder = folder
         self.limits = limits
         self._checked_by = checked_by
         folder.mkdir(parents=True, exist_ok=True)
+        self._lock = FolderLock(folder)
         self._catalogue = Catalogue(folder)
         self._live: dict[str, Upload] = {}
         self._parts: dict[str, int] = {}
@@ -76,7 +79,16 @@ class TrajectoryStore:
         self._checks = Checks(examiner)
         self._recent: deque[Submission] = deque(maxlen=_RECENT_MAX)
         self._serial = 0
-        self._scan()
+        try:
+            self._scan()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    @property
+    def problem(self) -> str:
+        """Why another process may use the folder, too; "" where it may not."""
+        return self._lock.problem
 
     # ---- what is there ---------------------------------------------------------------------------------------------
 
@@ -260,10 +272,11 @@ class TrajectoryStore:
                 self._settle(job, job.submission, finding)
 
     def close(self) -> None:
-        """End what is under way; uploads are kept to be gone on with."""
+        """End what is under way and let another store have the folder; uploads are kept to be gone on with."""
         for upload in list(self._live.values()):
             self.leave(upload)
         self._checks.close()
+        self._lock.release()
 
     # ---- within ----------------------------------------------------------------------------------------------------
 

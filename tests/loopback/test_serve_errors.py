@@ -14,6 +14,7 @@ from companion import Client
 from companion.cli import main
 from companion.errors import LinkError
 from companion.flight.bundled import free_udp_port
+from companion.ground.folder_lock import FolderLock
 
 
 def test_nobody_answers() -> None:
@@ -66,6 +67,25 @@ def test_a_port_in_use_ends_it_at_once(
             for number, handler in handlers.items():
                 signal.signal(number, handler)
     assert "is in use (process " in capfd.readouterr().err
+
+
+def test_a_folder_in_use_ends_it_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "trajectories"
+    folder.mkdir()
+    lock = FolderLock(folder)
+    free = [f"udpin:127.0.0.1:{free_udp_port()}" for _ in range(2)]
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        arguments = ["--engine", "python", "--connect", free[0], "--ground", free[1]]
+        assert main(["serve", "--vehicle", "paper", *arguments]) == 2
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        lock.release()
+    assert f"--folder {folder}: another `companion serve` uses it; give each its own" in capfd.readouterr().err
 
 
 def test_the_supervisor_killed(tmp_path: Path) -> None:

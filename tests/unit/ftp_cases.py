@@ -28,6 +28,11 @@ def make_store(folder: Path, check: Check = accepts, limits: Limits = DEFAULT_LI
     return TrajectoryStore(folder, Here(check), limits)
 
 
+def killed(store: TrajectoryStore) -> None:
+    """What the system does when the process of a store is killed: the lock is gone, all else stays as it is."""
+    store._lock.release()
+
+
 class Recorder:
     """A ground link that keeps what is sent."""
 

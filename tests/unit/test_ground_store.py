@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from ftp_cases import accepts, make_store
+from ftp_cases import accepts, killed, make_store
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -95,7 +95,7 @@ def test_a_refused_upload_changes_nothing(tmp_path):
     assert done.finding == Finding(False, "lap.csv: asks for too much")
     assert done.id is None
     assert (tmp_path / "lap.csv").read_bytes() == b"good\n"
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".catalogue.json", "lap.csv"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".catalogue.json", ".lock", "lap.csv"]
 
 
 def test_a_verdict_names_the_file_as_people_know_it(tmp_path):
@@ -161,7 +161,10 @@ def test_an_upload_goes_on_after_a_cut_and_after_a_restart(tmp_path):
     store.write(upload, 20, b"klmno")
     store.leave(upload)
     assert (tmp_path / ".part-x.csv").read_bytes() == b"0123456789"
-    for again in (store, make_store(tmp_path)):
+    for restarted in (False, True):
+        if restarted:
+            killed(store)
+        again = make_store(tmp_path) if restarted else store
         upload = again.begin("x.csv", resume=True)
         assert (upload.received, upload.crc32) == (10, crc32(b"0123456789"))
         again.leave(upload)
@@ -177,6 +180,7 @@ def test_a_killed_upload_is_found_again(tmp_path):
     store = make_store(tmp_path)
     store.write(store.begin("x.csv"), 0, b"0123456789")
     (tmp_path / ".check-4-y.csv").write_bytes(b"whole\n")
+    killed(store)
     again = make_store(tmp_path)
     assert again.begin("x.csv", resume=True).received == 10
     assert again.begin("y.csv", resume=True).received == 6
@@ -190,6 +194,7 @@ def test_numbers_stay(tmp_path):
     put(store, "a.csv", b"other\n")
     store.rename("b.csv", "d.csv")
     store.remove("c.csv")
+    store.close()
     again = make_store(tmp_path)
     assert [(e.id, e.name) for e in again.entries()] == [(1, "a.csv"), (2, "d.csv")]
     put(again, "c.csv", b"x\n")
@@ -204,6 +209,7 @@ def test_files_put_there_by_hand_are_numbered_and_checked(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"changed\n")
     (tmp_path / "link.csv").symlink_to("/etc/passwd")
     (tmp_path / "folder").mkdir()
+    killed(store)
     again = make_store(tmp_path)
     assert [e.accepted for e in again.entries()] == [None, None]
     again.update()
@@ -225,6 +231,7 @@ def test_another_vehicle_checks_anew(tmp_path):
         store.update()
         assert len(checked) == times
         assert store.entry("a.csv").accepted
+        store.close()
 
 
 def test_a_file_that_names_a_changed_one_is_checked_anew(tmp_path):
@@ -239,7 +246,9 @@ def test_a_file_that_names_a_changed_one_is_checked_anew(tmp_path):
 
 @pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"next_id": "x", "files": [{}]}', b"\xff", b"[" * 100_000])
 def test_a_damaged_catalogue_is_written_anew(tmp_path, damage):
-    put(make_store(tmp_path), "a.csv", b"x\n")
+    store = make_store(tmp_path)
+    put(store, "a.csv", b"x\n")
+    store.close()
     (tmp_path / ".catalogue.json").write_bytes(damage)
     store = make_store(tmp_path)
     store.update()

@@ -4,7 +4,7 @@ import errno
 import json
 
 import pytest
-from ftp_cases import VEHICLE, Network, Raw, make_store
+from ftp_cases import VEHICLE, Network, Raw, killed, make_store
 
 from companion.cli import main
 from companion.errors import InputError, LinkError, RefusedError
@@ -135,6 +135,7 @@ def test_it_goes_on_when_the_server_is_started_again(tmp_path):
     def progress(there, total):
         if there > 50_000 and not restarted:
             restarted.append(there)
+            killed(network.server._store)
             network.server = FileServer(make_store(tmp_path))
 
     assert client(network).upload_bytes(LINES[:100_000], "lap.csv", progress=progress).accepted
