@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import stat
 from bisect import bisect_left, bisect_right
 from pathlib import Path
 from typing import Final
@@ -13,9 +15,15 @@ from companion.ground.names import StoreError
 
 HOLES_MAX: Final = 20_000
 """More pieces than this are nobody's honest upload: blocks of 80 bytes with 10 % loss make 1300 pieces of 1 MB."""
+USUAL_BLOCKS: Final = (80, 239)
+"""Bytes of a full block of the usual clients (MAVProxy, pymavlink, Mission Planner; QGroundControl, MAVSDK). A file in
+one block of another length is shorter than its client's block, as far as can be known."""
+CUT: Final = "it may be cut off, as it ends with a full block: add an empty line at its end, or use `companion upload`"
 _CHUNK_BYTES = 1 << 16
-_TEXT_ENDS = (b"\n", b"}", b"]")
-"""How a complete trajectory file ends, whatever its format; a cut one rarely does."""
+_BLANK = b" \t\r\n"
+_MARK = b"\xef\xbb\xbf"
+"""Some programs begin a text in UTF-8 with it."""
+_END_BYTES = 256
 
 
 class Ranges:
@@ -81,7 +89,9 @@ class Upload:
         self._crc = 0
         self._crc_end = 0
         self._block_max = 0
+        self._written_begin = size_max
         self._written_end = 0
+        """From where to where this sender has written."""
         self._last_block = (0, 0)
         """Begin and end of the block that reaches furthest."""
         size = os.fstat(self._fd).st_size
@@ -125,6 +135,7 @@ class Upload:
             self.failed = True
             raise
         self._block_max = max(self._block_max, len(data))
+        self._written_begin = min(self._written_begin, offset)
         if end >= self._written_end:
             self._written_end = end
             self._last_block = (offset, end)
@@ -135,8 +146,9 @@ class Upload:
 
         Args:
             expected: size and checksum of the whole, from a sender that says them. Without them a file is taken for
-                whole that has no holes, ends where the writing ended, and either with a short block or as a text
-                ends: a client that gives up also ends its session.
+                whole that has no holes, ends where the writing ended, and either with a short block or as a JSON
+                document: a client that gives up also ends its session, and its last block, a full one like those
+                before, may well end with a line.
         """
         there, end = self._ranges.prefix, self._ranges.end
         if self.failed:
@@ -151,11 +163,24 @@ class Upload:
             return "it is empty"
         if self._written_end != end:
             return "what was sent ends before what was there already"
-        begin, stop = self._last_block
-        short = stop - begin < self._block_max
-        if not short and not os.pread(self._fd, 1, end - 1).endswith(_TEXT_ENDS):
-            return "it may be cut off, as it ends with a full block and without a line end (add one)"
-        return None
+        return None if self._ends_short() or self._closes_itself() else CUT
+
+    def begins(self, path: Path) -> bool:
+        """Whether this is the beginning of a longer file, as an upload of it that was cut off would be."""
+        with contextlib.suppress(OSError):  # what is not there, or cannot be read, is not cut by anybody
+            other = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+            try:
+                state = os.fstat(other)
+                if not stat.S_ISREG(state.st_mode) or state.st_size <= self.received:
+                    return False
+                return all(
+                    os.pread(other, length, at) == os.pread(self._fd, length, at)
+                    for at in range(0, self.received, _CHUNK_BYTES)
+                    for length in [min(_CHUNK_BYTES, self.received - at)]
+                )
+            finally:
+                os.close(other)
+        return False
 
     def close(self, *, whole: bool = False) -> None:
         """Close the hidden file, cut to what can be gone on with; remove it when that is nothing.
@@ -175,6 +200,19 @@ class Upload:
         if there == 0 and not whole:
             self.path.unlink(missing_ok=True)
 
+    def _ends_short(self) -> bool:
+        """Whether the last block is shorter than the sender's blocks are."""
+        begin, end = self._last_block
+        if end - begin < self._block_max:
+            return True
+        return begin == self._written_begin and end - begin not in USUAL_BLOCKS
+
+    def _closes_itself(self) -> bool:
+        """Whether it begins and ends as a JSON document, of which the check takes no beginning for the whole."""
+        head = os.pread(self._fd, _END_BYTES, 0).removeprefix(_MARK).lstrip(_BLANK)
+        tail = os.pread(self._fd, _END_BYTES, max(0, self.received - _END_BYTES)).rstrip(_BLANK)
+        return head.startswith(b"{") and tail.endswith(b"}")
+
     def _contradicts(self, offset: int, data: bytes) -> bool:
         for begin, end in self._ranges.overlaps(offset, offset + len(data)):
             if os.pread(self._fd, end - begin, begin) != data[begin - offset : end - offset]:
@@ -186,6 +224,7 @@ class Upload:
         self._ranges = Ranges()
         self._crc = self._crc_end = 0
         self._block_max = self._written_end = 0
+        self._written_begin = self._size_max
         self._last_block = (0, 0)
 
     def _follow(self) -> None:

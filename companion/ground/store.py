@@ -27,6 +27,7 @@ from companion.ground.names import StoreError, usable
 from companion.ground.staging import Upload
 
 NOT_CHECKED: Final = "not checked yet"
+BEGINNING: Final = "it is the beginning of the file that is stored: remove that one first, or use `companion upload`"
 _PART, _CHECK = ".part-", ".check-"
 _RECENT_MAX = 8
 _QUEUE_MAX = 8
@@ -246,6 +247,8 @@ class TrajectoryStore:
             OSError: the disk does not take it.
         """
         missing = upload.missing(expected)
+        if missing is None and expected is None and self._shortens(upload):
+            missing = BEGINNING
         if missing is None and len(self._checks.submitted()) >= _QUEUE_MAX:
             missing = "too many files wait to be checked"
         if missing is not None:
@@ -277,6 +280,11 @@ class TrajectoryStore:
             self.leave(upload)
         self._checks.close()
         self._lock.release()
+
+    def _shortens(self, upload: Upload) -> bool:
+        """Whether an upload is the beginning of what is stored under its name, or about to be."""
+        before = [job.path for job in self._checks.submitted() if job.name == upload.name]
+        return any(upload.begins(path) for path in [self.folder / upload.name, *before])
 
     # ---- within ----------------------------------------------------------------------------------------------------
 

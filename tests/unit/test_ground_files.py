@@ -243,6 +243,48 @@ def test_giving_up_is_no_upload(client, tmp_path, said):
     assert RECEIVED.unpack(client.granted(Opcode.OPEN_FILE_WO, b"lap.csv").data)[0] == 800
 
 
+ROWS = b"t_s,x_m,y_m,z_m    \n" + b"".join(b"%6.2f,%6.2f,%5.2f\n" % (i, i, 2.0) for i in range(7))
+"""Every block of 80 bytes ends with a line."""
+
+
+@pytest.mark.parametrize("end", [Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS])
+@pytest.mark.parametrize("blocks", [1, 2])
+@pytest.mark.parametrize("stored", [b"", ROWS + b"  7.00,  7.00, 2.00\n", TEXT])
+def test_giving_up_at_the_end_of_a_line_is_no_upload(client, tmp_path, said, end, blocks, stored):
+    if stored:
+        client.put("lap.csv", stored)
+    client.granted(Opcode.CREATE_FILE, b"lap.csv")
+    for at in range(0, 80 * blocks, 80):
+        client.granted(Opcode.WRITE_FILE, ROWS[at : at + 80], offset=at)
+    reply = client.ask(end)
+    assert reply.opcode == (Opcode.NAK if end == Opcode.TERMINATE_SESSION else Opcode.ACK)
+    assert said[-1] == (
+        "lap.csv: it may be cut off, as it ends with a full block: add an empty line at its end, or use"
+        " `companion upload`; not stored",
+        False,
+    )
+    assert (tmp_path / "lap.csv").read_bytes() == stored if stored else not (tmp_path / "lap.csv").exists()
+
+
+@pytest.mark.parametrize("block", [80, 239])
+def test_an_empty_line_at_the_end_cures_a_length_that_ends_with_a_full_block(client, tmp_path, block):
+    content = (ROWS * 300)[: 239 * 80]
+    assert client.put("lap.csv", content, block=block).opcode == Opcode.NAK
+    assert client.put("lap.csv", content + b"\n", block=block).opcode == Opcode.ACK
+    assert (tmp_path / "lap.csv").read_bytes() == content + b"\n"
+
+
+def test_the_beginning_of_what_is_stored_does_not_replace_it(client, tmp_path, said):
+    client.put("lap.csv", TEXT)
+    reply = client.put("lap.csv", TEXT[:300])
+    assert (reply.opcode, tuple(reply.data)) == (Opcode.NAK, failed(errno.EAGAIN))
+    assert said[-1][0] == (
+        "lap.csv: it is the beginning of the file that is stored: remove that one first, or use `companion upload`;"
+        " not stored"
+    )
+    assert (tmp_path / "lap.csv").read_bytes() == TEXT
+
+
 def test_a_sender_that_says_what_the_whole_is(client, tmp_path):
     client.granted(Opcode.CREATE_FILE, b"/lap.csv")
     client.granted(Opcode.WRITE_FILE, TEXT[:239])

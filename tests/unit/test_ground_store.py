@@ -18,7 +18,7 @@ from companion.ground.staging import Ranges
 from companion.ground.store import Limits, TrajectoryStore
 
 
-def put(store, name, content, *, expected=None, block=100):
+def put(store, name, content, *, expected=None, block=239):
     upload = store.begin(name)
     for at in range(0, len(content), block):
         store.write(upload, at, content[at : at + block])
@@ -119,7 +119,18 @@ def test_a_check_with_a_fault_refuses(tmp_path):
         ([(0, b"aa\n")], None, None),
         ([(0, b"a" * 10), (10, b"bbb")], None, None),
         ([(0, b"a" * 10), (10, b"b" * 10)], None, "may be cut off"),
-        ([(0, b"a" * 10), (10, b"b" * 9 + b"\n")], None, None),
+        ([(0, b"a" * 10), (10, b"b" * 9 + b"\n")], None, "may be cut off"),
+        ([(0, b"a" * 10), (10, b"b" * 9 + b"\n"), (20, b"\n")], None, None),
+        ([(20, b"\n"), (10, b"b" * 9 + b"\n"), (0, b"a" * 10)], None, None),
+        ([(0, b"a" * 60 + b"\n")], None, None),
+        ([(0, b"a" * 79 + b"\n")], None, "may be cut off"),
+        ([(0, b"a" * 238 + b"\n")], None, "may be cut off"),
+        ([(0, b"a" * 79 + b"\n"), (0, b"a" * 79 + b"\n")], None, "may be cut off"),
+        ([(0, b"a" * 100 + b"\n")], None, None),
+        ([(0, b'{"items":'), (9, b"[[1, 2]]}")], None, None),
+        ([(0, b'\n{"items"'), (9, b":[1, 2]}\n")], None, None),
+        ([(0, b'{"items":'), (9, b"[[1, 2]] ")], None, "may be cut off"),
+        ([(0, b"x = { a=1"), (9, b",b=2345 }")], None, "may be cut off"),
         ([(0, b"a" * 10), (20, b"bbb")], None, "bytes are missing from 10 on"),
         ([(10, b"bbb")], None, "bytes are missing from 0 on"),
         ([], None, "it is empty"),
@@ -141,6 +152,39 @@ def test_only_the_whole_is_taken(tmp_path, blocks, expected, reason):
         with pytest.raises(StoreError, match=reason):
             store.submit(upload, expected)
         assert visible(tmp_path) == []
+
+
+def test_the_beginning_of_what_is_stored_does_not_replace_it(tmp_path):
+    """Also where the last block is a short one; a sender that says size and checksum may shorten a file."""
+    store = make_store(tmp_path)
+    whole = b"1,2,3\n" * 100_000
+    put(store, "lap.csv", whole)
+    for length in (30, 300, 599_994):
+        with pytest.raises(StoreError, match="is the beginning of the file that is stored: remove") as caught:
+            put(store, "lap.csv", whole[:length])
+        assert caught.value.errno == errno.EAGAIN
+        assert (tmp_path / "lap.csv").read_bytes() == whole
+    assert put(store, "lap.csv", whole).finding.accepted
+    assert put(store, "lap.csv", whole[:-2] + b"4\n").finding.accepted
+    assert put(store, "other.csv", whole[:300]).finding.accepted
+    assert put(store, "lap.csv", whole[:300], expected=(300, crc32(whole[:300]))).finding.accepted
+    store.remove("lap.csv")
+    assert put(store, "lap.csv", whole[:294]).finding.accepted
+
+
+def test_nor_of_what_is_being_checked(tmp_path):
+    store = TrajectoryStore(tmp_path, Apart(os.path.basename))
+    first = put(store, "lap.csv", b"1,2,3\n" * 100)
+    with pytest.raises(StoreError, match="is the beginning of the file"):
+        put(store, "lap.csv", b"1,2,3\n" * 50)
+    assert wait(store, first).accepted
+    store.close()
+
+
+def test_a_pipe_of_that_name_holds_nothing_up(tmp_path):
+    store = make_store(tmp_path)
+    os.mkfifo(tmp_path / "lap.csv")
+    assert put(store, "lap.csv", b"1,2,3\n").finding.accepted
 
 
 def test_a_block_that_contradicts_begins_afresh(tmp_path):
