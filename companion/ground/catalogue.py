@@ -99,7 +99,8 @@ def file_crc32(path: Path) -> int:
         OSError: it cannot be read.
     """
     total = 0
-    with path.open("rb") as file:
+    fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(fd, "rb") as file:
         while chunk := file.read(_CHUNK_BYTES):
             total = crc32(chunk, total)
     return total

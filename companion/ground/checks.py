@@ -34,6 +34,8 @@ class Job:
     """None for a file that is stored already."""
     mtime_ns: int = 0
     """Of a stored file: which of its versions is checked."""
+    void: bool = False
+    """Whether what is found does not count any more: the file, or one that it names, has changed since it began."""
 
 
 class Checks:
@@ -46,11 +48,17 @@ class Checks:
         self._running: tuple[Job, Examination] | None = None
 
     def add(self, job: Job) -> None:
-        """Have a file checked; a stored one that waits already waits once."""
+        """Have a file checked; a stored one waits once, as it was last, and a check of it that runs is void."""
         if job.submission is not None:
             self._uploads.append(job)
-        elif all(job.name != other.name for other in self._stored):
+            return
+        if self._running is not None and self._running[0].submission is None and self._running[0].name == job.name:
+            self._running[0].void = True
+        waiting = next((i for i, other in enumerate(self._stored) if other.name == job.name), None)
+        if waiting is None:
             self._stored.append(job)
+        else:
+            self._stored[waiting] = job
 
     def submitted(self) -> list[Job]:
         """The uploads that have no verdict yet."""
@@ -59,18 +67,20 @@ class Checks:
 
     def next(self) -> tuple[Job, Finding] | None:
         """The next file that has its verdict; None while there is none. Never waits."""
-        while self._running is None:
-            if not self._uploads and not self._stored:
+        while True:
+            while self._running is None:
+                if not self._uploads and not self._stored:
+                    return None
+                job = (self._uploads or self._stored).popleft()
+                if job.path.exists():  # it may have been removed or renamed meanwhile
+                    self._running = (job, self._examiner.begin(job.path))
+            job, examination = self._running
+            finding = examination.poll()
+            if finding is None:
                 return None
-            job = (self._uploads or self._stored).popleft()
-            if job.path.exists():  # it may have been removed or renamed meanwhile
-                self._running = (job, self._examiner.begin(job.path))
-        job, examination = self._running
-        finding = examination.poll()
-        if finding is None:
-            return None
-        self._running = None
-        return job, finding._replace(verdict=_renamed(finding.verdict, job))
+            self._running = None
+            if not job.void:
+                return job, finding._replace(verdict=_renamed(finding.verdict, job))
 
     def close(self) -> None:
         """Stop what runs, forget what waits."""

@@ -109,4 +109,4 @@ class Startable:
             raise LookupError(f"no trajectory has the id {identity}")
         if not entry.accepted:
             raise LookupError(f"{entry.name}: {entry.verdict}")
-        return entry.name, str(self._store.path(entry.name).absolute())
+        return entry.name, str((self._store.folder / entry.name).absolute())

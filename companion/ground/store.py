@@ -4,6 +4,9 @@ What arrives goes to a hidden file first, is checked there, and takes its name b
 or refused leaves no half file, and the trajectory that had the name before stays as it is. No sockets, no threads, no
 waiting: a check runs apart (`examine`), and `update` takes in what came of it.
 
+What somebody changes in the folder by hand is noticed when it is asked for, by size and time of change: such a file is
+read anew, and not accepted until it is checked again.
+
 Hidden files: `.part-NAME` is an upload that is under way, or was cut off and can be gone on with; `.check-N-NAME` is
 one that is being checked; `.catalogue.json` is what is known of the others; `.lock` keeps a second store out.
 """
@@ -15,10 +18,14 @@ import errno
 import json
 import os
 import stat
+import time
 from collections import deque
+from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from companion.ground.by_hand import FileState, Newcomers, file_state
 from companion.ground.catalogue import Catalogue, Entry, file_crc32, sync_folder
 from companion.ground.checks import Checks, Job, Submission
 from companion.ground.examine import Examiner, Finding
@@ -33,6 +40,8 @@ _RECENT_MAX = 8
 _QUEUE_MAX = 8
 _NAMING_BYTES_MAX = 1 << 20
 """A file of ours that names another one is shorter than this."""
+_READ_BYTES = 8 << 20
+"""Of files that changed by hand so much is read in one turn, and the file that this ends in: some milliseconds."""
 
 
 class Limits(NamedTuple):
@@ -55,7 +64,14 @@ DEFAULT_LIMITS: Final = Limits()
 class TrajectoryStore:
     """One folder of trajectory files."""
 
-    def __init__(self, folder: Path, examiner: Examiner, limits: Limits = DEFAULT_LIMITS, checked_by: str = "") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        examiner: Examiner,
+        limits: Limits = DEFAULT_LIMITS,
+        checked_by: str = "",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Open the folder, making it if need be; see what is in it.
 
         Args:
@@ -63,6 +79,7 @@ class TrajectoryStore:
             examiner: the vehicle's own check, see `examine.Apart` and `examine.Here`.
             limits: how much is taken.
             checked_by: what a verdict depends on beside the file; verdicts given under another one are given anew.
+            clock: seconds, for how often to look for new files.
 
         Raises:
             InputError: another process has it open.
@@ -80,6 +97,9 @@ class TrajectoryStore:
         self._checks = Checks(examiner)
         self._recent: deque[Submission] = deque(maxlen=_RECENT_MAX)
         self._serial = 0
+        self._newcomers = Newcomers(folder, clock)
+        self._unread: dict[str, None] = {}
+        """Names of files that changed or came by hand and are still to be read, in their order."""
         try:
             self._scan()
         except BaseException:
@@ -94,8 +114,10 @@ class TrajectoryStore:
     # ---- what is there ---------------------------------------------------------------------------------------------
 
     def entries(self) -> list[Entry]:
-        """All stored files, by number."""
-        return sorted(self._catalogue.entries.values())
+        """All stored files, by number; not those of which too many changed at once to be read yet."""
+        self._look()
+        self._read_some()
+        return sorted(entry for name, entry in self._catalogue.entries.items() if name not in self._unread)
 
     def entry(self, name: str) -> Entry:
         """The stored file of that name.
@@ -103,14 +125,17 @@ class TrajectoryStore:
         Raises:
             StoreError: there is none.
         """
-        found = self._catalogue.entries.get(name)
+        self._look()
+        found = self._current(name)
         if found is None:
             raise StoreError(errno.ENOENT, f"{name}: there is no such file")
         return found
 
     def numbered(self, number: int) -> Entry | None:
         """The stored file with that number."""
-        return next((entry for entry in self._catalogue.entries.values() if entry.id == number), None)
+        self._look()
+        name = next((entry.name for entry in self._catalogue.entries.values() if entry.id == number), None)
+        return None if name is None else self._current(name)
 
     def path(self, name: str) -> Path:
         """Where a stored file is.
@@ -160,7 +185,7 @@ class TrajectoryStore:
         if name not in self._live:
             self._drop_part(name)
         del self._catalogue.entries[name]
-        self._recheck_users(name)
+        self._recheck_users([name])
         self._save()
 
     def rename(self, old: str, new: str) -> None:
@@ -171,7 +196,7 @@ class TrajectoryStore:
             OSError: it cannot be renamed.
         """
         entry = self.entry(old)
-        if new in self._catalogue.entries:
+        if new in self._catalogue.entries or os.path.lexists(self.folder / new):  # also one that nobody told us of
             raise StoreError(errno.EEXIST, f"{new}: there is a file of that name already")
         os.rename(self.folder / old, self.folder / new)
         del self._catalogue.entries[old]
@@ -181,8 +206,7 @@ class TrajectoryStore:
         self._save()
         if changed.accepted is None:
             self._recheck(new)
-        self._recheck_users(old)
-        self._recheck_users(new)
+        self._recheck_users([old, new])
 
     # ---- uploads ---------------------------------------------------------------------------------------------------
 
@@ -267,6 +291,7 @@ class TrajectoryStore:
 
     def update(self) -> None:
         """Take in what the check found, and begin the next one. To be called often; never waits for a check."""
+        self._read_some()
         while (done := self._checks.next()) is not None:
             job, finding = done
             if job.submission is None:
@@ -308,10 +333,11 @@ class TrajectoryStore:
         entry = self._entry(number, name, job.path, submission.crc32, finding)
         os.replace(job.path, self.folder / name)
         self._catalogue.entries[name] = entry
+        self._unread.pop(name, None)
         submission.id = number
         with contextlib.suppress(OSError):  # the file is whole in any case; only a loss of power could undo its name
             sync_folder(self.folder)
-        self._recheck_users(name)
+        self._recheck_users([name])
         self._save()
 
     def _recheck(self, name: str) -> None:
@@ -320,12 +346,17 @@ class TrajectoryStore:
         self._catalogue.entries[name] = known._replace(accepted=None, verdict=NOT_CHECKED)
         self._checks.add(Job(self.folder / name, name, mtime_ns=known.mtime_ns))
 
-    def _recheck_users(self, name: str) -> None:
-        """Have the files checked anew that name another one, which has changed."""
-        for entry in self.entries():
-            if entry.name != name and entry.name.endswith(".toml") and entry.size_bytes <= _NAMING_BYTES_MAX:
+    def _recheck_users(self, names: list[str]) -> None:
+        """Have the files checked anew that name others, which have changed."""
+        if not names:
+            return
+        changed = [name.encode() for name in names]
+        for entry in sorted(self._catalogue.entries.values()):
+            ours = entry.name.lower().endswith(".toml") and entry.size_bytes <= _NAMING_BYTES_MAX
+            if ours and entry.name not in names:
                 with contextlib.suppress(OSError):
-                    if name.encode() in (self.folder / entry.name).read_bytes():
+                    text = (self.folder / entry.name).read_bytes()
+                    if any(name in text for name in changed):
                         self._recheck(entry.name)
 
     def _judge(self, job: Job, finding: Finding) -> None:
@@ -334,9 +365,12 @@ class TrajectoryStore:
         known = self._catalogue.entries.get(name)
         if known is None or known.accepted is not None or known.mtime_ns != job.mtime_ns:
             return  # it has been replaced or removed meanwhile
-        with contextlib.suppress(OSError):
-            self._catalogue.entries[name] = self._entry(known.id, name, self.folder / name, known.crc32, finding)
-            self._save()
+        if self._state(name) != (known.size_bytes, known.mtime_ns):
+            return  # nobody knows which contents were checked; the next look has the new ones checked
+        self._catalogue.entries[name] = known._replace(
+            accepted=finding.accepted, verdict=finding.verdict, checked_by=self._checked_by
+        )
+        self._save()
 
     def _entry(self, number: int, name: str, path: Path, crc: int, finding: Finding) -> Entry:
         found = path.stat()
@@ -358,9 +392,65 @@ class TrajectoryStore:
         if self._parts.pop(name, None) is not None:
             (self.folder / f"{_PART}{name}").unlink(missing_ok=True)
 
+    # ---- what others did to the folder -----------------------------------------------------------------------------
+
+    def _state(self, name: str) -> FileState | None:
+        return file_state(f"{self.folder}/{name}", self.limits.file_bytes)  # for all of them at once: Path is slow
+
+    def _look(self) -> None:
+        """Notice what somebody did by hand since the last look. Files are read later: this takes a moment only."""
+        entries = self._catalogue.entries
+        gone, changed = [], []
+        for name, entry in entries.items():
+            state = self._state(name)
+            if state is None:
+                gone.append(name)
+            elif state != (entry.size_bytes, entry.mtime_ns) and name not in self._unread:
+                changed.append(name)
+        for name in gone:
+            del entries[name]
+            self._unread.pop(name, None)
+        for name in changed:  # the old size and time stay until it is read: a restart finds the difference again
+            entries[name] = entries[name]._replace(accepted=None, verdict=NOT_CHECKED)
+        known = entries.keys() | self._unread.keys()
+        candidates = (name for name in self._newcomers.names() if name not in known and self._state(name) is not None)
+        new = list(islice(candidates, max(0, self.limits.files - len(known))))
+        self._unread |= dict.fromkeys(changed + new)
+        if gone or changed or new:
+            self._recheck_users(gone + changed + new)
+            self._save()
+
+    def _read_some(self) -> None:
+        """Read of the files that changed or came by hand as many as a turn has time for."""
+        if not self._unread:
+            return
+        left = _READ_BYTES
+        while self._unread and left > 0:
+            entry = self._read(next(iter(self._unread)))
+            left -= 0 if entry is None else entry.size_bytes
+        self._save()  # now: a number that was told must not be given again
+
+    def _current(self, name: str) -> Entry | None:
+        """What is known of a file, after reading it if it has changed."""
+        if name not in self._unread:
+            return self._catalogue.entries.get(name)
+        entry = self._read(name)
+        self._save()
+        return entry
+
+    def _read(self, name: str) -> Entry | None:
+        """Take in a file that changed or came by hand; None when it is gone again, or cannot be read."""
+        del self._unread[name]
+        state, known = self._state(name), self._catalogue.entries.pop(name, None)
+        if state is not None:
+            self._adopt(name, state, known)
+        if name not in self._catalogue.entries:
+            self._newcomers.look_again()
+        return self._catalogue.entries.get(name)
+
     def _scan(self) -> None:
         """See what is in the folder after a start: files, their changes, and what an earlier run left behind."""
-        seen: list[tuple[str, os.stat_result]] = []
+        seen: list[tuple[str, FileState]] = []
         left: list[tuple[float, str, int]] = []
         with os.scandir(self.folder) as found:
             for item in found:
@@ -374,13 +464,16 @@ class TrajectoryStore:
                         os.replace(item.path, self.folder / f"{_PART}{name}")
                     left.append((state.st_mtime, name, state.st_size))
                 elif usable(item.name) and state.st_size <= self.limits.file_bytes:
-                    seen.append((item.name, state))
+                    seen.append((item.name, FileState(state.st_size, state.st_mtime_ns)))
         self._adopt_parts(left)
         known = self._catalogue.entries
         seen.sort(key=lambda pair: (pair[0] not in known, pair[0]))
         self._catalogue.entries = {}
-        for name, state in seen[: self.limits.files]:
-            self._adopt(name, state, known.get(name))
+        for name, found_state in seen[: self.limits.files]:
+            self._adopt(name, found_state, known.get(name))
+        entries = self._catalogue.entries
+        kept = {name for name, entry in entries.items() if name in known and entry.crc32 == known[name].crc32}
+        self._recheck_users([name for name in sorted(entries.keys() | known.keys()) if name not in kept])
         self._save()
 
     def _adopt_parts(self, left: list[tuple[float, str, int]]) -> None:
@@ -392,10 +485,10 @@ class TrajectoryStore:
         while len(self._parts) > self.limits.parts:
             self._drop_part(next(iter(self._parts)))
 
-    def _adopt(self, name: str, state: os.stat_result, known: Entry | None) -> None:
+    def _adopt(self, name: str, state: FileState, known: Entry | None) -> None:
         """Take a file that is there; what changed about it is checked anew."""
         path = self.folder / name
-        if known is not None and (known.size_bytes, known.mtime_ns) == (state.st_size, state.st_mtime_ns):
+        if known is not None and (known.size_bytes, known.mtime_ns) == state:
             if known.checked_by == self._checked_by and known.accepted is not None:
                 self._catalogue.entries[name] = known
                 return
@@ -407,9 +500,9 @@ class TrajectoryStore:
                 return
         number = self._catalogue.number() if known is None else known.id
         self._catalogue.entries[name] = Entry(
-            number, name, state.st_size, state.st_mtime_ns, checksum, None, NOT_CHECKED, self._checked_by
+            number, name, state.size_bytes, state.mtime_ns, checksum, None, NOT_CHECKED, self._checked_by
         )
-        self._checks.add(Job(path, name, mtime_ns=state.st_mtime_ns))
+        self._checks.add(Job(path, name, mtime_ns=state.mtime_ns))
 
 
 def _told(submission: Submission) -> dict[str, Any]:

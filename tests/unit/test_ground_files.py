@@ -182,6 +182,18 @@ def test_the_client_chooses_the_number_of_a_session(client):
     assert client.refused(Opcode.WRITE_FILE, b"x", session=200) == PROTECTED
 
 
+def test_what_changes_by_hand_is_answered_as_it_is(client, tmp_path):
+    client.put("lap.csv", TEXT)
+    (tmp_path / "lap.csv").write_bytes(b"changed\n")
+    (tmp_path / "new.csv").write_bytes(b"by hand\n")
+    assert client.granted(Opcode.LIST_DIRECTORY, b"/").data.split(b"\0")[1:3] == [b"Flap.csv\t8", b"Fnew.csv\t8"]
+    assert int.from_bytes(client.granted(Opcode.CALC_FILE_CRC32, b"lap.csv").data, "little") == crc32(b"changed\n")
+    assert client.get("lap.csv") == b"changed\n" and client.get("new.csv") == b"by hand\n"
+    assert client.refused(Opcode.RENAME, b"lap.csv\0new.csv") == EXISTS
+    (tmp_path / "lap.csv").unlink()
+    assert client.refused(Opcode.OPEN_FILE_RO, b"lap.csv") == NOT_FOUND
+
+
 def test_two_clients_with_the_same_number(server):
     one, two = Raw(server, (255, 190)), Raw(server, (254, 190))
     one.granted(Opcode.CREATE_FILE, b"one.csv")

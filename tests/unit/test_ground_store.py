@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from companion.ground.examine import Apart, Finding, Here
 from companion.ground.ftp import crc32
+from companion.ground.hosting import Startable
 from companion.ground.names import StoreError, checked_name, usable
 from companion.ground.staging import Ranges
 from companion.ground.store import Limits, TrajectoryStore
@@ -259,6 +260,234 @@ def test_files_put_there_by_hand_are_numbered_and_checked(tmp_path):
     again.update()
     found = {e.name: (e.id, e.accepted, e.crc32) for e in again.entries()}
     assert found == {"a.csv": (1, True, crc32(b"changed\n")), "by hand.csv": (2, False, crc32(b"bad\n"))}
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self):
+        self.now_s = 0.0
+
+    def __call__(self):
+        return self.now_s
+
+
+def watched(folder, check=accepts, **options):
+    clock = Clock()
+    return TrajectoryStore(folder, Here(check), clock=clock, **options), clock
+
+
+def write_by_hand(path, content):
+    """As an editor does it, at a time that no two writes share."""
+    before = path.stat().st_mtime_ns if path.exists() else time.time_ns()
+    path.write_bytes(content)
+    os.utime(path, ns=(before + 1_000_000, before + 1_000_000))
+
+
+def test_a_file_that_comes_by_hand_is_found_while_it_runs(tmp_path):
+    store, clock = watched(tmp_path)
+    put(store, "a.csv", b"x\n")
+    assert [e.name for e in store.entries()] == ["a.csv"]
+    write_by_hand(tmp_path / "b.csv", b"by hand\n")
+    (tmp_path / "link.csv").symlink_to("/etc/passwd")
+    clock.now_s += 1.9
+    assert [e.name for e in store.entries()] == ["a.csv"]
+    clock.now_s += 0.2
+    found = store.numbered(2) or store.entries()[-1]
+    assert (found.id, found.name, found.size_bytes, found.crc32) == (2, "b.csv", 8, crc32(b"by hand\n"))
+    assert (found.accepted, found.verdict) == (None, "not checked yet")
+    store.update()
+    assert store.entry("b.csv").accepted and [e.name for e in store.entries()] == ["a.csv", "b.csv"]
+    store.close()
+    assert make_store(tmp_path).entry("b.csv").id == 2
+
+
+def test_a_name_that_is_not_known_is_looked_for(tmp_path):
+    store, clock = watched(tmp_path)
+    with pytest.raises(StoreError):
+        store.entry("b.csv")
+    write_by_hand(tmp_path / "b.csv", b"by hand\n")
+    clock.now_s += 2.1
+    assert store.entry("b.csv").size_bytes == 8
+
+
+def test_a_folder_that_does_not_change_is_not_read_again(tmp_path, monkeypatch):
+    store, clock = watched(tmp_path)
+    put(store, "a.csv", b"x\n")
+    os.utime(tmp_path, (1.7e9, 1.7e9))
+    store.entries()
+    listed = []
+    monkeypatch.setattr("companion.ground.by_hand.os.listdir", lambda folder: listed.append(folder) or [])
+    for _ in range(5):
+        clock.now_s += 2.1
+        store.entries()
+    assert listed == []
+    os.utime(tmp_path, (1.7e9, 1.7e9 + 1))
+    clock.now_s += 2.1
+    store.entries()
+    assert listed == [tmp_path]
+
+
+def test_a_file_that_changes_by_hand_is_read_and_checked_again(tmp_path):
+    store, _ = watched(tmp_path)
+    put(store, "a.csv", b"good\n")
+    write_by_hand(tmp_path / "a.csv", b"bad!\n")
+    (entry,) = json.loads(store.index())["trajectories"]
+    assert entry == {"id": 1, "name": "a.csv", "size_bytes": 5, "crc32": crc32(b"bad!\n"), "accepted": None,
+                     "verdict": "not checked yet"}  # fmt: skip
+    store.update()
+    assert store.entry("a.csv").accepted is False
+    write_by_hand(tmp_path / "a.csv", b"good again\n")
+    with pytest.raises(LookupError, match=r"a\.csv: not checked yet"):
+        Startable(store).find(1)
+    store.update()
+    assert Startable(store).find(1) == ("a.csv", str(tmp_path / "a.csv"))
+    fd, entry = store.open("a.csv")
+    os.close(fd)
+    assert entry.size_bytes == 11
+
+
+def test_a_file_that_goes_by_hand_is_gone(tmp_path):
+    store, _ = watched(tmp_path)
+    put(store, "a.csv", b"x\n")
+    put(store, "lap.toml", b'file = "a.csv"\n')
+    (tmp_path / "a.csv").unlink()
+    with pytest.raises(LookupError, match="no trajectory has the id 1"):
+        Startable(store).find(1)
+    with pytest.raises(LookupError, match=r"lap\.toml: not checked yet"):
+        Startable(store).find(2)
+    assert put(store, "a.csv", b"x\n").id == 3
+
+
+def test_what_names_a_file_that_changed_by_hand_is_not_started(tmp_path):
+    store, _ = watched(tmp_path)
+    put(store, "lap.csv", b"x\n")
+    put(store, "lap.toml", b'file = "lap.csv"\n')
+    write_by_hand(tmp_path / "lap.csv", b"y\n")
+    with pytest.raises(LookupError, match=r"lap\.toml: not checked yet"):
+        Startable(store).find(2)
+    store.update()
+    assert Startable(store).find(2)[0] == "lap.toml"
+    store.close()
+    write_by_hand(tmp_path / "lap.csv", b"z\n")
+    assert make_store(tmp_path).entry("lap.toml").accepted is None
+
+
+class Steered:
+    """An examiner whose checks end when they are told to."""
+
+    def __init__(self):
+        self.begun, self.finding = [], None
+
+    def begin(self, path):
+        self.begun.append(path.read_bytes())
+        return self
+
+    def poll(self):
+        finding, self.finding = self.finding, None
+        return finding
+
+    def cancel(self):
+        pass
+
+
+def test_a_verdict_is_not_given_to_other_contents_than_were_checked(tmp_path):
+    examiner = Steered()
+    (tmp_path / "a.csv").write_bytes(b"good\n")
+    store = TrajectoryStore(tmp_path, examiner)
+    store.update()
+    write_by_hand(tmp_path / "a.csv", b"changed while it was checked\n")
+    examiner.finding = Finding(True, "may be flown")
+    store.update()
+    assert store.entry("a.csv").accepted is None
+    store.update()
+    examiner.finding = Finding(False, "no")
+    store.update()
+    assert store.entry("a.csv").verdict == "no"
+    assert examiner.begun == [b"good\n", b"changed while it was checked\n"]
+
+
+def test_a_check_of_what_has_changed_since_is_void(tmp_path):
+    """Also of a file that names another one: what it read of that is no longer so."""
+    examiner = Steered()
+    (tmp_path / "lap.csv").write_bytes(b"x\n")
+    (tmp_path / "lap.toml").write_bytes(b'file = "lap.csv"\n')
+    store = TrajectoryStore(tmp_path, examiner)
+    store.update()
+    examiner.finding = Finding(True, "the first")
+    store.update()
+    assert store.entry("lap.csv").accepted and len(examiner.begun) == 2
+    write_by_hand(tmp_path / "lap.csv", b"y\n")
+    store.entries()
+    examiner.finding = Finding(True, "of the old contents")
+    store.update()
+    assert store.entry("lap.toml").accepted is None
+    for _ in range(2):
+        examiner.finding = Finding(True, "anew")
+        store.update()
+    assert [e.verdict for e in store.entries()] == ["anew", "anew"]
+
+
+def test_many_files_by_hand_hold_nobody_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.ground.store._READ_BYTES", 1000)
+    store, _ = watched(tmp_path)
+    for i in range(10):
+        write_by_hand(tmp_path / f"{i}.csv", b"x" * 400)
+    assert [e.name for e in store.entries()] == ["0.csv", "1.csv", "2.csv"]
+    assert store.entry("9.csv").id == 4
+    for _ in range(3):
+        store.update()
+    assert len(store.entries()) == 10 and all(e.accepted for e in store.entries())
+    for i in range(10):
+        write_by_hand(tmp_path / f"{i}.csv", b"y" * 400)
+    assert len(store.entries()) == 3
+    assert store.numbered(4).crc32 == crc32(b"y" * 400) and store.numbered(4).accepted is None
+    (tmp_path / "8.csv").unlink()
+    for _ in range(4):
+        store.update()
+    assert [e.crc32 for e in store.entries()] == [crc32(b"y" * 400)] * 9
+
+
+def test_a_restart_in_between_keeps_the_numbers(tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.ground.store._READ_BYTES", 1)
+    store, _ = watched(tmp_path)
+    for name in ("a.csv", "b.csv", "c.csv"):
+        put(store, name, b"x\n")
+        write_by_hand(tmp_path / name, b"changed\n")
+    store.entries()
+    killed(store)
+    again = make_store(tmp_path)
+    assert [(e.id, e.name, e.accepted) for e in again.entries()] == [(i + 1, "abc"[i] + ".csv", None) for i in range(3)]
+
+
+def test_a_file_that_cannot_be_read_is_tried_again(tmp_path, monkeypatch):
+    store, clock = watched(tmp_path)
+    write_by_hand(tmp_path / "a.csv", b"x\n")
+    os.utime(tmp_path, (1.7e9, 1.7e9))
+
+    def refuses(path):
+        raise PermissionError(errno.EACCES, "denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("companion.ground.store.file_crc32", refuses)
+        assert store.entries() == []
+    clock.now_s += 2.1
+    assert [e.name for e in store.entries()] == ["a.csv"]
+
+
+def test_a_rename_does_not_overwrite_what_came_by_hand(tmp_path):
+    store, _ = watched(tmp_path)
+    put(store, "a.csv", b"x\n")
+    store.entries()
+    write_by_hand(tmp_path / "b.csv", b"precious\n")
+    (tmp_path / "c.csv").symlink_to("nowhere")
+    for name in ("b.csv", "c.csv"):
+        with pytest.raises(StoreError) as caught:
+            store.rename("a.csv", name)
+        assert caught.value.errno == errno.EEXIST
+    assert (tmp_path / "b.csv").read_bytes() == b"precious\n"
+    store.rename("a.csv", "d.csv")
+    assert store.entry("d.csv").id == 1
 
 
 def test_another_vehicle_checks_anew(tmp_path):
