@@ -115,7 +115,8 @@ def replay(
     if changed is None:
         flight = adapted(flight, engagement.adaptation)
     trajectory = of_flight(flight)
-    course = Course(trajectory, flight.vehicle, engagement.hold_point_m, engagement.yaw_rad, engagement.home_m)
+    where = engagement.hold_point_m, engagement.yaw_rad, engagement.home_m
+    course = Course(trajectory, flight.vehicle, *where, flight.height_min_m)
     for ramp in engagement.ramps:
         course.change_pace(ramp)
     tracker = controller_of(flight, engine)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,10 +10,11 @@ from dataclasses import replace
 from companion.config import Vehicle
 from companion.control.types import Reference, Vec3
 from companion.errors import RefusedError
+from companion.flight.clearance import Clearance
 from companion.flight.tempo import Ramp, RampPlan, Tempo
 from companion.trajectory.anchored import Anchored, Trajectory, anchored
 from companion.trajectory.flatness import PointMass, ReferenceLimits, demand
-from companion.trajectory.joins import Join, join, stop
+from companion.trajectory.joins import SHARE, Join, join, stop
 from companion.trajectory.pieces import Piece, chain
 from companion.trajectory.timing import paced
 from companion.trajectory.vehicle_limits import point_mass, reference_limits
@@ -35,12 +37,39 @@ def gentle(limits: ReferenceLimits, end: Reference, model: PointMass) -> Referen
     )
 
 
-def _gently(plan: Callable[[ReferenceLimits], Join], limits: ReferenceLimits, easy: ReferenceLimits) -> Join:
+_BRISKER = (SHARE, 0.75, 1.0)
+"""Shares of the vehicle's own limits that are tried for a way that stays clear: the brisker, the shorter it is."""
+
+Plan = Callable[[ReferenceLimits, float], Join]
+"""Gives a join or a stop that keeps to limits and to a share of them."""
+
+
+def _gently(plan: Plan, limits: ReferenceLimits, easy: ReferenceLimits) -> Join:
     """The plan within the easy limits, or within the vehicle's own where those do not do."""
     try:
-        return plan(easy)
+        return plan(easy, SHARE)
     except RefusedError:
-        return plan(limits)
+        return plan(limits, SHARE)
+
+
+def _clear(plan: Plan, limits: ReferenceLimits, easy: ReferenceLimits, clear: Callable[[Join], bool]) -> Join:
+    """The gentlest plan that stays clear of ground and fences; where none does, the gentlest."""
+    gentle_one = _gently(plan, limits, easy)
+    if clear(gentle_one):
+        return gentle_one
+    for share in _BRISKER:
+        with contextlib.suppress(RefusedError):
+            brisk = plan(limits, share)
+            if clear(brisk):
+                return brisk
+    return gentle_one
+
+
+_ADVICE = {
+    "join": ("its join", "; hold higher up or elsewhere, or let it begin at rest"),
+    "track": ("it", ""),
+    "stop": ("the stop after it", "; let it end at rest, or with more room"),
+}
 
 
 def at_rest(p: Vec3, yaw_rad: float) -> Reference:
@@ -57,27 +86,42 @@ class Course:
         hold_point: where the vehicle is held, NED [m].
         yaw_rad: the heading there.
         home: the home position, NED [m], if known.
+        height_min_m: what join and stop are to stay above, over home; None: nothing is looked at but the limits.
 
     Raises:
         RefusedError: the join or the stop cannot be flown within the limits.
     """
 
     def __init__(
-        self, trajectory: Trajectory, vehicle: Vehicle, hold_point: Vec3, yaw_rad: float, home: Vec3 | None
+        self,
+        trajectory: Trajectory,
+        vehicle: Vehicle,
+        hold_point: Vec3,
+        yaw_rad: float,
+        home: Vec3 | None,
+        height_min_m: float | None = None,
     ) -> None:
         self.hold_point, self.yaw_rad, self.home = hold_point, yaw_rad, home
         self._limits, self._model = limits, model = reference_limits(vehicle), point_mass(vehicle)
         path: Anchored = anchored(trajectory, hold_point, home)
+        self._clearance: Clearance | None = None
+        if height_min_m is not None:
+            self._clearance = Clearance(path, vehicle.limits, hold_point, home, height_min_m)
         pieces: list[Piece] = []
         self.join_s = 0.0
         if trajectory.join == "smooth":
             begin = path.at(0.0)
             rest = at_rest(hold_point, yaw_rad)
-            joined = _gently(lambda use: join(rest, begin, use, model), limits, gentle(limits, begin, model))
+            joined = _clear(
+                lambda use, share: join(rest, begin, use, model, share),
+                *(limits, gentle(limits, begin, model), lambda way: self._is_clear(way, joins=True)),
+            )
             pieces.append(joined)
             self.join_s = joined.duration_s
         end = path.at(path.duration_s)
-        stopping = _gently(lambda use: stop(end, use, model), limits, gentle(limits, end, model))
+        stopping = _clear(
+            lambda use, share: stop(end, use, model, share), limits, gentle(limits, end, model), self._is_clear
+        )
         self.path = path
         self.track_s = path.duration_s
         self.stop_s = stopping.duration_s
@@ -107,6 +151,21 @@ class Course:
     def pieces(self) -> tuple[tuple[float, Piece], ...]:
         """Join (if there is one), trajectory and stop, as planned and at their own pace, each with its begin [s]."""
         return tuple(zip(self._chain.starts_s, self._chain.pieces, strict=True))
+
+    def _is_clear(self, way: Piece, *, joins: bool = False) -> bool:
+        return self._clearance is None or self._clearance.breach(way, joins=joins) is None
+
+    def obstruction(self) -> str:
+        """What is in the way of it, ground or a fence, for people; "": nothing, as far as that is known."""
+        if self._clearance is None:
+            return ""
+        for _, piece in self.pieces:
+            joins = piece is not self.path and self.join_s > 0.0 and piece is self._chain.pieces[0]
+            breach = self._clearance.breach(piece, joins=joins)
+            if breach is not None:
+                name, advice = _ADVICE["join" if joins else "track" if piece is self.path else "stop"]
+                return f"{name} {breach.sentence}, {breach.at_s:.1f} s after it began{advice}"
+        return ""
 
     def shift(self, by_m: Vec3) -> None:
         """Moves all of it (NED): after the autopilot's estimate has jumped by as much."""

@@ -133,7 +133,7 @@ def inspect(
         return Inspection(trajectory, path, (), (), None, None, None, None, None, tuple(problems))
     ground, nearest, in_place = place_problems(path, fence, height_min_m)
     problems += in_place
-    start, end, at_ends = _ends(trajectory, vehicle, path, hold_point, yaw_rad)
+    start, end, at_ends = _ends(trajectory, vehicle, path, hold_point, yaw_rad, height_min_m)
     problems += at_ends
     return Inspection(
         trajectory,
@@ -199,13 +199,13 @@ def _snap_steps(path: Anchored, model: PointMass, of: torque.Body) -> tuple[torq
 
 
 def _ends(
-    trajectory: Trajectory, vehicle: Vehicle, path: Anchored, hold_point: Vec3, yaw_rad: float
+    trajectory: Trajectory, vehicle: Vehicle, path: Anchored, hold_point: Vec3, yaw_rad: float, height_min_m: float
 ) -> tuple[End | None, End | None, list[Problem]]:
     """Return both ends with the way that the flight gets there and away, and what speaks against it."""
     model, of = point_mass(vehicle), torque.body(vehicle)
     first, last = path.at(0.0), path.at(path.duration_s)
     try:
-        course = Course(trajectory, vehicle, hold_point, yaw_rad, ORIGIN)
+        course = Course(trajectory, vehicle, hold_point, yaw_rad, ORIGIN, height_min_m)
     except RefusedError as error:
         joined = "no way to join it or to stop after it"
         ends = (_end(first, 0.0, model, of, joined), _end(last, path.duration_s, model, of, joined))
@@ -213,6 +213,9 @@ def _ends(
     by_law = trajectory.join == "law"
     there = "the law's bounded position error" if by_law else f"a join of {course.join_s:.1f} s"
     problems = []
+    obstruction = course.obstruction()
+    if obstruction and not obstruction.startswith("it "):  # the trajectory itself was looked at before
+        problems.append(Problem("join" if obstruction.startswith("its join") else "stop", None, obstruction))
     if not by_law:
         before = course.at(course.join_s - JUST_BEFORE_S)
         jump = max(dist(a, b) for a, b in zip(before[:4], first[:4], strict=True))

@@ -165,7 +165,7 @@ def gate_reference(trajectory: Trajectory, vehicle: Vehicle) -> None:
 def gate_place(trajectory: Trajectory, height_min_m: float) -> None:
     """The trajectory stays above the ground and within the fence that came with it, where its anchor says where it is.
 
-    One that begins wherever the vehicle holds is looked at there (`surroundings.gate_ground`).
+    One that begins wherever the vehicle holds is looked at there (`surroundings.gate_course`).
 
     Raises:
         RefusedError: with the first figure that fails.

@@ -22,7 +22,7 @@ from companion.flight.orders import Orders
 from companion.flight.phases import Autopilot, Cause, FlightEnded, LandedState, Order, Phase
 from companion.flight.planning import Planning
 from companion.flight.preflight import Preflight
-from companion.flight.surroundings import gate_ground
+from companion.flight.surroundings import gate_course
 from companion.frames import GeoPoint, yaw_from_quat
 from companion.link import modes
 from companion.link.modes import Mode
@@ -442,8 +442,9 @@ class Sequence:
     def _new_course(self, hold: Vec3, yaw_rad: float, home: Vec3 | None, home_global: GeoPoint | None) -> Course:
         """Runs beside the loop: it only uses what it is given and what never changes."""
         trajectory, flight = self._trajectory, self._flight
-        course = Course(trajectory, flight.vehicle, hold, yaw_rad, home_for(trajectory, home, home_global))
-        gate_ground(course.path, home, flight.height_min_m)
+        place, height_min_m = home_for(trajectory, home, home_global), flight.height_min_m
+        course = Course(trajectory, flight.vehicle, hold, yaw_rad, place, height_min_m)
+        gate_course(course, home, height_min_m)
         return course
 
     def _enter_offboard(self, now_s: float) -> None:

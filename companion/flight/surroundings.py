@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from companion.control.types import Vec3
 from companion.errors import RefusedError
+from companion.flight.clearance import own_fence_margins
+from companion.flight.course import Course
 from companion.trajectory.anchored import Anchored, Trajectory
 from companion.trajectory.batch import batch
 from companion.trajectory.feasibility import grid
@@ -58,17 +60,13 @@ def place_problems(
                 f" {height_min_m:g} m are required",
             )
         )
-    margins = [part.margins(points) for part in (fence, _own_fence(path.trajectory)) if part is not None]
+    own = own_fence_margins(path, points)
+    margins = [found for found in (None if fence is None else fence.margins(points), own) if found is not None]
     nearest = _nearest(times_s, np.min(margins, axis=0)) if margins else None
     if nearest is not None and not nearest.value_m > 0.0:
         sentence = f"leaves the fence by {-nearest.value_m:.2f} m at {nearest.at_s:.2f} s"
         problems.append(Problem("fence", nearest.at_s, sentence))
     return ground, nearest, problems
-
-
-def _own_fence(trajectory: Trajectory) -> Fence | None:
-    """The fence that came with a trajectory; where the vehicle happens to be it does not stand."""
-    return None if trajectory.anchor == "here" else trajectory.fence
 
 
 def _height_unknown(trajectory: Trajectory) -> bool:
@@ -82,21 +80,24 @@ def _nearest(times_s: Sequence[float], margins: NDArray[np.float64]) -> Margin:
     return Margin(float(margins[at]), times_s[at])
 
 
-def gate_ground(path: Anchored, home: Vec3 | None, height_min_m: float) -> None:
-    """A trajectory in its place in the local frame stays above the ground, as far as home says where that is.
+def gate_course(course: Course, home: Vec3 | None, height_min_m: float) -> None:
+    """A course stays clear of ground and fences with its join and its stop, as far as home says where the ground is.
 
     Raises:
-        RefusedError: it asks for less height above home.
+        RefusedError: it does not; with the place where it comes nearest, or goes farthest beyond.
     """
-    if home is None:
-        return
-    times_s = grid(path)
-    height_m, at_s = _nearest(times_s, home[2] - batch(path, times_s).p[2])
-    if not height_m >= height_min_m:
-        raise RefusedError(
-            f"trajectory {path.trajectory.name!r}: height above home falls to {height_m:.2f} m at {at_s:.2f} s, at"
-            f" least {height_min_m:g} m are required (height_min_m of the flight file)"
-        )
+    name = course.path.trajectory.name
+    if home is not None and home != course.home:  # places on the Earth count from elsewhere: the ground is here too
+        times_s = grid(course.path)
+        height_m, at_s = _nearest(times_s, home[2] - batch(course.path, times_s).p[2])
+        if not height_m >= height_min_m:
+            raise RefusedError(
+                f"trajectory {name!r}: height above home falls to {height_m:.2f} m at {at_s:.2f} s, at"
+                f" least {height_min_m:g} m are required (height_min_m of the flight file)"
+            )
+    obstruction = course.obstruction()
+    if obstruction:
+        raise RefusedError(f"trajectory {name!r}: {obstruction}")
 
 
 def separation(paths: Sequence[Anchored], step_s: float = 0.02) -> tuple[Margin, tuple[int, int]] | None:

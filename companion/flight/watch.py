@@ -16,6 +16,7 @@ import numpy as np
 from companion.config import Flight
 from companion.control import flat
 from companion.control.types import State, Vec3
+from companion.flight.clearance import own_fence_margins
 from companion.flight.controller import Controller
 from companion.flight.course import Course
 from companion.flight.delay import Delay
@@ -206,13 +207,9 @@ class Watch:
             return f"{distance:.1f} m from home, limit {limits.fence_radius_m:g} m (limits.fence_radius_m)"
         if limits.fence_height_m is not None and height > limits.fence_height_m:
             return f"{height:.1f} m above home, limit {limits.fence_height_m:g} m (limits.fence_height_m)"
-        path = course.path
-        fence = path.trajectory.fence
-        if fence is not None and path.trajectory.anchor != "here":
-            dx, dy, c, s = x - path.offset_m[0], y - path.offset_m[1], path.cos_yaw, path.sin_yaw
-            margin = float(fence.margins(np.array([[c * dx + s * dy, c * dy - s * dx]]))[0])
-            if margin < 0.0:
-                return f"{-margin:.1f} m beyond the fence of trajectory {path.trajectory.name!r}"
+        own = own_fence_margins(course.path, np.array([[x, y]]))
+        if own is not None and own[0] < 0.0:
+            return f"{-own[0]:.1f} m beyond the fence of trajectory {course.path.trajectory.name!r}"
         health = self._autopilot.health
         kept = health is None or health.fence_kept is not False
         return "" if kept else "the autopilot says that its own fence is broken"
