@@ -35,7 +35,8 @@ from companion.flight.retuning import Transition, Turning, between
 from companion.flight.thrust_scale import ThrustScale
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
-PIECES_MAX = 100
+PIECES_MAX = 128
+"""Of 10 ms each, with some room beyond the longest delay that a vehicle file may have and what is followed above it."""
 THRUST_LIMITS = LIMIT_THRUST_MIN | LIMIT_THRUST_MAX
 ReferenceAt = Callable[[float], Reference]
 Numbers = tuple[float, ...]

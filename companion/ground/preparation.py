@@ -111,5 +111,6 @@ def _build_report(folder: Path) -> None:
 
 
 _REPORT: Final = (
-    f"import os, sys; os.nice({_NICE}); from companion.cli import main; sys.exit(main(['report', sys.argv[1]]))"
+    f"import os, sys; os.nice({_NICE}); from companion.realtime import rejoin; rejoin(); "
+    "from companion.cli import main; sys.exit(main(['report', sys.argv[1]]))"
 )

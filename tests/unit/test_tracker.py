@@ -1,5 +1,6 @@
 """The control step as the loop calls it: both engines give the same numbers; gaps are not integrated over."""
 
+import math
 import random
 
 import pytest
@@ -9,6 +10,7 @@ from companion.control import flat
 from companion.control.types import State
 from companion.control.vectors import quat_normalise
 from companion.flight.course import Course, at_rest
+from companion.flight.delay import CHANGE_MAX_S
 from companion.flight.tracker import Tracker, kernels
 from companion.trajectory.load import load
 
@@ -79,3 +81,15 @@ def test_the_reference_is_taken_at_the_time_of_effect():
     asked = []
     tracker.step(5.0, state, lambda t: asked.append(t) or at_rest(state.p, 0.0))
     assert asked == [pytest.approx(5.0 + flight.vehicle.link.state_age_s)]
+
+
+@pytest.mark.numba
+def test_the_longest_delay_that_may_be_followed_is_predicted_over():
+    link = {"state_age_s": 0.5, "command_delay_s": 0.5}
+    tracker = Tracker(load_vehicle("paper", {"link": link}), "rates", kernels("numba"))
+    state = State((1.0, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    tracker.begin(state)
+    tracker.retime(tracker.delay_s + CHANGE_MAX_S)
+    out = tracker.step(1.0, state, lambda t: at_rest((0.0, 0.0, -10.0), 0.0))
+    assert tracker.delay_s == pytest.approx(1.02)
+    assert all(math.isfinite(x) for x in out.rates)
