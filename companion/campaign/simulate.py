@@ -176,16 +176,33 @@ def fly_sampled(
         if not size < DIVERGED_M:
             at_s = stamp_s - begin_s
             raise RefusedError(f"the simulated flight diverges: position error {size:.3g} m at {at_s:.2f} s")
-        fresh = False
-        while queue and queue[0][0] <= airframe.t_us:
-            acting, fresh = queue.pop(0)[1], True
-        airframe.advance(acting, fresh, n_steps)
+        acting = _advance(airframe, acting, queue, n_steps)
         if i % 250 == 0:
             progress(i / count)
     progress(1.0)
     phases = [PhaseChange(Phase.TRACK.value, begin_s + course.join_s, "simulated")]
     meta = FlightMeta(trajectory.name, vehicle.name, 0, flight.statistics_from_s, flight.acceptance.thresholds())
     return Trace(rows, record, summarise(record, phases, meta), airframe.truth().disturbance_m_s2)
+
+
+def _advance(
+    airframe: Airframe, acting: inner_loops.Setpoint, queue: list[tuple[int, inner_loops.Setpoint]], n_steps: int
+) -> inner_loops.Setpoint:
+    """Run n_steps physics steps, each setpoint of the queue from the step on at which it is due; what acts in the end.
+
+    The queue has vehicle times [us], in order; what is due between two steps acts from the later one on.
+    """
+    fresh = False
+    while True:
+        while queue and queue[0][0] <= airframe.t_us:
+            acting, fresh = queue.pop(0)[1], True
+        until_due = -((airframe.t_us - queue[0][0]) // airframe.dt_us) if queue else n_steps
+        steps = min(n_steps, until_due)
+        airframe.advance(acting, fresh, steps)
+        n_steps -= steps
+        if n_steps == 0:
+            return acting
+        fresh = False
 
 
 def _hover(flight: Flight) -> Setpoint:

@@ -38,13 +38,15 @@ def case_of(flight, duration_s=1.0, vehicle=None, **more):
         ("eight", "attitude", {"command_delay_s": 0.008}),
         ("paper", "rates", {"state_age_s": 0.013}),
         ("eight", "rates", {"state_age_s": 0.0}),
+        ("eight", "rates", {"command_delay_s": 0.005}),  # in the middle of an interval, and of a physics step
+        ("eight", "rates", {"state_age_s": 0.015, "command_delay_s": 0.023, "state_rate_hz": 50.0}),
     ],
 )
 def test_the_kernel_flies_what_the_flight_step_by_step_flies(name, kind, link):
     flight = flight_of(name, kind, **link)
     whole = fly(case_of(flight), "python")
     trace = fly_sampled(flight, of_flight(flight), kernels("python"), duration_max_s=1.0)
-    assert len(whole.rows) == len(trace.rows) > 200
+    assert len(whole.rows) == len(trace.rows) > 0.9 * flight.vehicle.link.state_rate_hz
     record = trace.record
     for got, column in (
         (whole.rows[:, kernel.ERROR], record.columns("error_n", "error_e", "error_d")),

@@ -72,6 +72,19 @@ def test_the_same_seed_gives_the_same_flight_and_another_does_not():
     assert fly_sampled(other, trajectory, PLAIN).rows[-1] != a
 
 
+@pytest.mark.parametrize("command_s", [0.0, 0.005, 0.02])
+def test_a_delay_counts_the_same_on_either_side_of_the_companion(command_s):
+    """States come every 50 ms: a command that needs a part of it acts within the interval, not at its end."""
+    vehicle = load_vehicle("bundled")
+    link = vehicle.link.model_copy(
+        update={"state_rate_hz": 20.0, "state_age_s": 0.02 - command_s, "command_delay_s": command_s}
+    )
+    slow = vehicle.model_copy(update={"link": link})
+    flight = Flight(name="test", vehicle=slow, trajectory="circle")
+    found = predict(flight, load("circle"), PLAIN, 10.0)
+    assert found.error_max_m.value < 0.05 and found.tilt_max_rad.value < 0.3
+
+
 def test_prediction_names_time_and_size_of_the_worst_violation():
     flight, trajectory = short()
     found = gate_prediction(flight, trajectory, PLAIN)
