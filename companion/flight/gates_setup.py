@@ -7,6 +7,7 @@ from math import degrees, isfinite
 from typing import Final
 
 from companion.config import Flight
+from companion.control.output import thrust_fraction
 from companion.control.types import GRAVITY_M_S2
 from companion.flight.findings import Finding, Gate, Measured, passed, refused, warning
 from companion.flight.silence import when_silent
@@ -249,10 +250,11 @@ def thrust_scaling(m: Measured) -> Finding:
 
 
 def hover_thrust(m: Measured) -> Finding:
-    """What PX4 and the vehicle file take for the thrust of a hover."""
+    """What PX4 and the vehicle file take for the command that hovers, through the curve of the rotors."""
     gate, theirs = Gate.HOVER_THRUST, m.parameter("MPC_THR_HOVER")
     vehicle = m.flight.vehicle
-    ours = vehicle.body.mass_kg * GRAVITY_M_S2 / vehicle.thrust_full_n
+    weight_n = vehicle.body.mass_kg * GRAVITY_M_S2
+    ours = thrust_fraction(weight_n, vehicle.thrust_full_n, vehicle.rotors.curve_factor)
     limit = f"{ours:.2f} within {HOVER_TOLERANCE:.0%}"
     if theirs is None or not isfinite(theirs):
         return passed(gate, "MPC_THR_HOVER unknown", limit, "PX4's own hover thrust is not known")

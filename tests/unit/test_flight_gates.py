@@ -70,6 +70,7 @@ def measured(
 
 IN_AIR = {"armed": True, "landed": LandedState.IN_AIR}
 REAL = {"vehicle__simulated": False}
+CURVED = {"vehicle__rotors__curve_factor": 0.6}
 STICKS = {"sticks": True}
 OLD = AutopilotVersion((1, 12, 3), 255, 0, 0)
 NOT_FINITE = StateRejection.NOT_FINITE
@@ -153,6 +154,13 @@ CASES: list[tuple[Gate, str, dict[str, Any], str]] = [
     (Gate.THRUST_CURVE, "passed", dict(parameters={"THR_MDL_FAC": 0.3}), "at most once"),
     (Gate.THRUST_SCALING, "warning", dict(parameters={"MC_BAT_SCALE_EN": 1.0}), "battery's voltage"),
     (Gate.HOVER_THRUST, "warning", dict(parameters={"MPC_THR_HOVER": 0.7}), "by the vehicle file it is 0.49"),
+    (Gate.HOVER_THRUST, "passed", dict(parameters={"MPC_THR_HOVER": 0.63}, settings=CURVED), "agree"),
+    (
+        Gate.HOVER_THRUST,
+        "warning",
+        dict(parameters={"MPC_THR_HOVER": 0.45}, settings=CURVED),
+        "0.45, by the vehicle file it is 0.63",
+    ),
     (Gate.STATE_RATE, "refused", dict(link={"rate_hz": 189.0}), "ODOMETRY comes at 189 Hz, 200 Hz are required"),
     (Gate.STATE_RATE, "refused", dict(link={"rate_hz": None}), "no usable ODOMETRY within 5 s"),
     (
