@@ -7,6 +7,7 @@ limits; a path that comes back to where and how it began is simply flown again.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import remainder, tau
 from typing import Final
 
 from companion.control.types import Reference, Vec3
@@ -102,11 +103,12 @@ def _way_back(end: Reference, start: Reference, limits: PlanLimits, scale: float
 
 
 def _same(end: Reference, start: Reference) -> bool:
-    """Whether a lap can follow another as it is."""
+    """Whether a lap can follow another as it is; its heading may have made whole turns, which is the same direction."""
 
     def near(a: Vec3, b: Vec3) -> bool:
         return all(abs(x - y) <= SAME for x, y in zip(a, b, strict=True))
 
     vectors = zip(end[:5], start[:5], strict=True)
-    turning = abs(end.yaw_rate - start.yaw_rate) <= SAME and abs(end.yaw - start.yaw) <= SAME
+    turned_rad = remainder(end.yaw - start.yaw, tau)
+    turning = abs(end.yaw_rate - start.yaw_rate) <= SAME and abs(turned_rad) <= SAME
     return turning and all(near(a, b) for a, b in vectors)

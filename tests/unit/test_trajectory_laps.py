@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -12,8 +13,11 @@ from companion.config import Vehicle, load_vehicle
 from companion.errors import InputError
 from companion.trajectory.anchored import Trajectory, anchored
 from companion.trajectory.feasibility import check
+from companion.trajectory.laps import repeated
 from companion.trajectory.load import load
+from companion.trajectory.shapes import Circle, Heading
 from companion.trajectory.vehicle_limits import point_mass, reference_limits
+from companion.trajectory.waypoints import plan_limits
 
 POINTS = """shape = "waypoints"
 anchor = "local"
@@ -69,6 +73,20 @@ def test_a_closed_path_is_flown_again_at_once(tmp_path: Path, vehicle: Vehicle) 
     assert twice.duration_s == pytest.approx(2.0 * once.duration_s, rel=1e-12)
     assert near(twice.at(once.duration_s + 1.0).p, once.at(1.0).p)
     assert twice.notes[-1] == "2 laps, closed"
+
+
+@pytest.mark.parametrize("turns", [1, -2])
+def test_a_closed_path_whose_heading_made_whole_turns_is_closed(vehicle: Vehicle, turns: int) -> None:
+    lap_s = 4.0 * math.pi
+    circle = Circle(radius_m=5.0, angular_rate_rad_s=0.5, heading=Heading(0.3, turns * 0.5))
+    limits, model = reference_limits(vehicle), point_mass(vehicle)
+    thrice = repeated(circle, lap_s, 3, plan_limits(vehicle))
+    assert thrice.back_s == 0.0 and thrice.own_duration_s == pytest.approx(3.0 * lap_s, rel=1e-12)
+    for t_s in (0.0, 0.4 * lap_s, lap_s - 1e-6, lap_s, 1.5 * lap_s, 2.0 * lap_s, 3.0 * lap_s):
+        assert near(thrice.at(t_s).p, circle.at(t_s).p)
+        assert math.remainder(thrice.at(t_s).yaw - circle.at(t_s).yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+    path = anchored(Trajectory(name="thrice", shape=thrice, duration_s=thrice.own_duration_s), (0.0, 0.0, 0.0), None)
+    assert check(path, limits, model) == []
 
 
 def test_laps_of_another_programs_file(tmp_path: Path, vehicle: Vehicle) -> None:
