@@ -46,19 +46,20 @@ def vehicle_values(template: Vehicle, entered: Entered, found: Identified, facts
     full_n = motion.full_m_s2 * mass
     limits, body = template.limits, template.body
     scale = mass / body.mass_kg
+    rotor_n = _rounded(0.25 * full_n)
+    share_n = limits.thrust_max_n / template.thrust_full_n * full_n
+    most_n = _rounded(max(share_n, min(1.3 * mass * GRAVITY_M_S2, 0.95 * full_n)))
     values: dict[str, Any] = {
         "name": entered.name,
         "simulated": entered.simulated,
         "body.mass_kg": mass,
         "body.inertia_kg_m2": [_rounded(scale * x) for x in body.inertia_kg_m2],
         "body.drag_1_s": _rounded(max(motion.drag_1_s, 0.0)),
-        "rotors.thrust_max_n": _rounded(0.25 * full_n),
+        "rotors.thrust_max_n": rotor_n,
         "rotors.lag_s": _rounded(motion.lag_s),
         "rotors.curve_factor": _rounded(motion.curve_factor),
         "limits.thrust_min_n": _rounded(limits.thrust_min_n * scale),
-        "limits.thrust_max_n": _rounded(
-            max(limits.thrust_max_n / template.thrust_full_n * full_n, min(1.3 * mass * GRAVITY_M_S2, 0.95 * full_n))
-        ),
+        "limits.thrust_max_n": min(most_n, 4.0 * rotor_n),  # rounded by itself it can be more than they give
         "link.state_age_s": _rounded(found.age_s if found.age_s is not None else found.delay_s),
         "link.command_delay_s": _rounded(found.delay_s if found.age_s is not None else 0.0),
         "controller.measured_delay": found.age_s is not None,

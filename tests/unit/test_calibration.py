@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from datetime import date
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from companion.flight.course import at_rest
 from companion.flight.manoeuvres import Kind, Manoeuvre, length_s, plan
 from companion.identification.data import Grid, Held, flight_data, windows
 from companion.identification.identify import Identified, identify, rate_integrals
+from companion.identification.motion import MotionFit
 from companion.identification.vehicle_file import Entered, provenance, template_of, vehicle_values, written
 
 SHORT = {"repeats": 1, "run_length_m": 3.0, "run_speed_m_s": 2.0}
@@ -186,6 +188,21 @@ def test_the_bundled_vehicle_is_found(tmp_path) -> None:
         "sih_params: SIH_MASS" not in text
         and "# measured: a step of 6 rad/s is tracked" not in text.split("[limits]")[0]
     )
+
+
+@pytest.mark.parametrize(("mass_kg", "full_m_s2"), [(10.0, 28.23481), (1.1, 20.00002), (2.0, 17.5309)])
+def test_a_limit_that_is_all_that_the_rotors_give_stays_within_it_after_rounding(mass_kg, full_m_s2) -> None:
+    template = template_of("px4_sih")
+    limits = template.limits.model_copy(update={"thrust_max_n": template.thrust_full_n})
+    template = template.model_copy(update={"limits": limits})
+    motion = MotionFit(full_m_s2, 0.0, 0.05, 0.0, 0.5, 0.01, 0.0, 0.001, 0.001, 0.01, 0.01)
+    nothing = (None, None, None)
+    found = Identified(nothing, nothing, (0.5, 0.5, 0.5), motion, motion, 0.02, None, 60.0)
+    entered = Entered("mine", mass_kg, 0.1, False)
+    values = vehicle_values(template, entered, found, {})
+    assert values["limits.thrust_max_n"] <= 4.0 * values["rotors.thrust_max_n"]
+    assert values["limits.thrust_max_n"] == pytest.approx(mass_kg * full_m_s2, rel=1e-4)
+    written("px4_sih", values, provenance(found, {}, entered, Path("flight"), date(2026, 11, 27)))
 
 
 def test_a_calibration_that_is_no_date_is_refused() -> None:
