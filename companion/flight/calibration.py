@@ -33,6 +33,9 @@ REST_TILT_RAD = 0.2
 TILT_ABORT_RAD = 0.45
 """Beyond, a manoeuvre ends at once."""
 INTEGRAL_GAP_S = 0.1
+"""Over a longer time without a state nothing is integrated; where states are rarer, see INTEGRAL_GAP_INTERVALS."""
+INTEGRAL_GAP_INTERVALS = 2.5
+"""Up to so many nominal intervals without a state are no gap."""
 
 _NOTHING = [math.nan] * flat.RESULTS
 _NOTHING[flat.LIMITS] = 0.0
@@ -53,6 +56,7 @@ class Calibrator:
         vehicle = flight.vehicle
         self._vehicle, self._autopilot, self._notify = vehicle, autopilot, notify
         self._interval_s = 1.0 / vehicle.link.state_rate_hz
+        self._gap_s = max(INTEGRAL_GAP_S, INTEGRAL_GAP_INTERVALS * self._interval_s)
         self._slots = plan(flight.calibration)
         self.hover_share = self._of_file()
         """The command that hovers, of full."""
@@ -88,7 +92,7 @@ class Calibrator:
         if self._begun_s is None:
             self._begun_s = stamp_s
         dt_s = self._interval_s if self._last_s is None else stamp_s - self._last_s
-        integrates = 0.0 < dt_s <= INTEGRAL_GAP_S and not frozen
+        integrates = 0.0 < dt_s <= self._gap_s and not frozen
         self._last_s, self._seen = stamp_s, state
         t_s = stamp_s - self._begun_s
         reference = reference_at(stamp_s)._replace(yaw=self._yaw)

@@ -22,7 +22,9 @@ Array = npt.NDArray[np.float64]
 GRID_S: Final = 0.004
 """Step of the simulated responses; exact for commands that are held, so that only the sampling of the result counts."""
 GAP_MAX_S: Final = 0.08
-"""Longer without a state, a window ends."""
+"""Longer without a state, a window ends; where states are rarer, see GAP_INTERVALS."""
+GAP_INTERVALS: Final = 2.5
+"""Up to so many of the record's usual intervals without a state are no gap: one state may be lost."""
 WINDOW_S: Final = 6.0
 WINDOW_MIN_S: Final = 2.0
 AGE_MAX_S: Final = 0.5
@@ -93,7 +95,9 @@ def flight_data(source: FlightSource) -> FlightData:
 
 def windows(t_s: Array) -> tuple[slice, ...]:
     """Cuts stamps into windows of about WINDOW_S without gaps."""
-    edges = [0, *(np.flatnonzero(np.diff(t_s) > GAP_MAX_S) + 1).tolist(), len(t_s)]
+    apart_s = np.diff(t_s)
+    gap_s = max(GAP_MAX_S, GAP_INTERVALS * float(np.median(apart_s)))
+    edges = [0, *(np.flatnonzero(apart_s > gap_s) + 1).tolist(), len(t_s)]
     found = []
     for begin, end in itertools.pairwise(edges):
         length_s = t_s[end - 1] - t_s[begin]

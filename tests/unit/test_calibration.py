@@ -139,6 +139,33 @@ def test_a_gap_ends_a_window() -> None:
     assert cells.summed(np.ones((len(cells.edges_s) - 1, 1)))[:, 0] == pytest.approx(t_s[:100] - t_s[0])
 
 
+@pytest.mark.parametrize("rate_hz", [10.0, 12.0])
+def test_states_that_come_slowly_are_no_gaps_and_one_lost_state_is_none(rate_hz) -> None:
+    """The slowest that a vehicle file may ask for, with jitter."""
+    steps_s = (1.0 + 0.15 * np.sin(np.arange(600.0))) / rate_hz
+    steps_s[200] *= 2.0
+    steps_s[400] *= 4.0
+    t_s = np.cumsum(steps_s)
+    found = windows(t_s)
+    assert sum(w.stop - w.start for w in found) == 600
+    assert {w.start for w in found} >= {0, 400} and found[-1].stop == 600
+    assert all(np.diff(t_s[w]).max() < 2.5 / rate_hz for w in found)
+
+
+def test_a_calibration_at_ten_states_a_second_integrates_and_is_identified() -> None:
+    flight = calibration_flight({"repeats": 1}, link__state_rate_hz=10.0, world={"wind_m_s": (0.5, 0.0, 0.0)})
+    source, calibrator, told = fly(flight, hover_share=hover_share(flight, 0.0))
+    assert not any("left out" in line or "early" in line for line in told), told
+    found = identify(flight_data(source), flight.vehicle.autopilot.rate_integral_1_s, curved=False)
+    assert found.motion.full_m_s2 == pytest.approx(20.0, rel=0.01)
+    still = State(ZERO, ZERO, LEVEL, ZERO)
+    calibrator.begin(still)
+    for t_s in (0.0, 0.112, 0.221):  # 10 Hz with jitter
+        out = calibrator.step(t_s, still._replace(p=(1.0, 0.0, 0.0)), lambda t: at_rest(ZERO, 0.0))
+    late = calibrator.step(0.221 + 0.3, still._replace(p=(1.0, 0.0, 0.0)), lambda t: at_rest(ZERO, 0.0))
+    assert out.b_hat[0] == pytest.approx(0.15 * (0.1 + 0.112 + 0.109), rel=1e-6) and late.b_hat == out.b_hat
+
+
 def test_rate_integrals_come_from_the_parameters_where_they_are_told() -> None:
     told = {"MC_ROLLRATE_P": 0.15, "MC_ROLLRATE_I": 0.2, "MC_PITCHRATE_P": 0.0, "MC_PITCHRATE_I": 0.2}
     assert rate_integrals(told, (9.0, 8.0, 7.0)) == pytest.approx((0.2 / 0.15, 8.0, 7.0))
