@@ -171,7 +171,7 @@ def _flown(
             cost += LOST + math.log(study.file.diverged_m)
             continue
         m = outcome.measures
-        effort = m["actuation_rad_s2"]
+        effort = m["actuation_rad_s2"] if math.isfinite(m["actuation_rad_s2"]) else 1.0  # lost before the trajectory
         if outcome.converged and math.isfinite(m["rms_m"]) and effort > 0.0:
             converged += 1
             rms.append(math.log(m["rms_m"]))
@@ -182,7 +182,9 @@ def _flown(
             cost += LOST + math.log(max(worst, 1.0)) + wish.actuation_weight * math.log(max(effort, 1.0))
     mean_rms = math.exp(sum(rms) / len(rms)) if rms else math.nan
     mean_actuation = math.exp(sum(actuation) / len(actuation)) if actuation else math.nan
-    return Score(cost / wish.flights, "", least, margin_s, mean_rms, mean_actuation, converged, wish.flights)
+    # the search would take NaN for the best that there is
+    each, unfit = (cost / wish.flights, "") if math.isfinite(cost) else (UNFIT, "flights whose cost is no number")
+    return Score(each, unfit, least, margin_s, mean_rms, mean_actuation, converged, wish.flights)
 
 
 def _score_of(task: tuple[str, dict[str, float], Wish, int, str]) -> Score:
@@ -209,7 +211,7 @@ def tune(
         progress: called after every generation with the number of gain sets judged, and the best one's score.
 
     Raises:
-        RefusedError: no gain set is allowed.
+        RefusedError: no gain set is allowed, or none flies.
     """
     from scipy.optimize import differential_evolution
 
@@ -256,14 +258,25 @@ def tune(
                 f"no gain set of {count} is allowed for vehicle {vehicle.name!r}; the best has {at.unfit}: ask for less"
                 " margin, or reduce the delay and the lags"
             )
+        _refuse_lost(vehicle, at, "of the search")
         before = {name: float(getattr(vehicle.controller, name)) for name in gains}
         many = min(4 * wish.flights, max(study.total - wish.flights, wish.flights))
         fresh, fresh_before = judge([gains, before], wish.flights, many)
+        _refuse_lost(vehicle, fresh, "that the search has not seen")
         steps = list(itertools.product(GAINS, (STEP, 1.0 / STEP)))
         changed = [complete(vehicle, [gains[n] * (f if n == name else 1.0) for n in GAINS]) for name, f in steps]
         scores = judge(changed, 0, wish.flights)
     neighbours = [Neighbour(name, factor, s) for (name, factor), s in zip(steps, scores, strict=True)]
     return Tuned(gains, before, at, fresh, fresh_before, neighbours, count)
+
+
+def _refuse_lost(vehicle: Vehicle, found: Score, which: str) -> None:
+    """Gains with which every flight is lost are nobody's choice. Raises RefusedError."""
+    if found.converged == 0:
+        raise RefusedError(
+            f"the best gain set for vehicle {vehicle.name!r} converges in none of {found.flights} flights {which}: ease"
+            " the study's disturbances, or fly them longer (duration_s)"
+        )
 
 
 def _unused(_: FloatArray) -> float:

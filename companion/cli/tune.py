@@ -1,6 +1,7 @@
 """STUDY gives the flight, its vehicle and the disturbances (docs/campaigns.md). Only gains that pass the certificate
 and leave the delay margin that is asked for are flown; all fly the same flights. The choice is explained, and compared
-with the gains of before in flights that the search has not seen. Exit code 3: no gains are allowed.
+with the gains of before in flights that the search has not seen. Exit code 3: no gains are allowed, or no flight
+converges with the best.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def run(
         task = bar.add_task("searching", total=generations)
 
         def progress(count: int, best: search.Score) -> None:
-            state = best.unfit[:40] or f"{best.rms_m * 100:.2f} cm rms"
+            flown = f"{best.rms_m * 100:.2f} cm rms" if best.converged else "no flight converges"
+            state = best.unfit[:40] or flown
             bar.update(task, advance=1, description=f"{count} gain sets, best {state}")
 
         tuned = search.tune(found, wish, chosen, generations=generations, workers=workers, progress=progress)

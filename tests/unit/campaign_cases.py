@@ -6,7 +6,7 @@ from companion.campaign.study import load_study
 
 TINY = """
 name = "tiny"
-flight = "eight"
+flight = "{flight}"
 count = {count}
 seed = 3
 duration_s = {duration_s}
@@ -19,14 +19,14 @@ mass_factor = {{ uniform = [0.95, 1.05] }}
 """
 
 
-def tiny(folder, count=3, duration_s=0.5, more=""):
+def tiny(folder, count=3, duration_s=0.5, more="", flight="eight"):
     """A study of `count` flights."""
-    return load_study(str(tiny_file(folder, count, duration_s, more)))
+    return load_study(str(tiny_file(folder, count, duration_s, more, flight)))
 
 
-def tiny_file(folder, count=3, duration_s=0.5, more=""):
+def tiny_file(folder, count=3, duration_s=0.5, more="", flight="eight"):
     path = folder / "tiny.toml"
-    path.write_text(TINY.format(count=count, duration_s=duration_s) + more)
+    path.write_text(TINY.format(count=count, duration_s=duration_s, flight=flight) + more)
     return path
 
 

@@ -45,10 +45,34 @@ def test_better_tracking_costs_less_and_a_lost_flight_more(tmp_path):
     assert tune.score(lost, OWN, WISH, 0, "auto").cost > good.cost + tune.LOST
 
 
+def test_a_flight_that_is_lost_in_its_join_has_a_cost(tmp_path):
+    """It never comes to the trajectory, so that there is no actuation on it."""
+    lost = tiny(tmp_path, duration_s=8.0, more="thrust_factor = { constant = 0.48 }\n").to_json()
+    found = tune.score(lost, OWN, WISH, 0, "auto")
+    assert (found.unfit, found.converged) == ("", 0) and tune.LOST < found.cost < tune.UNFIT
+
+
+def test_a_cost_that_is_no_number_is_that_of_gains_that_are_not_allowed(tmp_path):
+    """The search would take NaN for the best that there is."""
+    wish = WISH._replace(actuation_weight=math.nan)
+    found = tune.score(tiny(tmp_path).to_json(), OWN, wish, 0, "python")
+    assert found.cost == tune.UNFIT and "no number" in found.unfit
+
+
+def test_it_is_refused_when_no_flight_converges(tmp_path, monkeypatch):
+    """The study ends while the trajectory is still being joined."""
+    monkeypatch.setattr(tune, "POPULATION", 1)
+    study = tiny(tmp_path, count=4, duration_s=0.2, more="[vary.controller]\nk1_1_s = { uniform = [1.9, 2.0] }\n")
+    with pytest.raises(RefusedError, match=r"converges in none of 1 flights of the search: ease the study's"):
+        tune.tune(study, WISH, "python", generations=1, workers=1)
+
+
 def test_the_search_chooses_explains_and_compares(tmp_path, monkeypatch):
     monkeypatch.setattr(tune, "POPULATION", 1)
-    more = "[vary.controller]\nk1_1_s = { uniform = [1.9, 2.0] }\n[converged]\nstatistics_after_s = 0.0\n"
-    study = tiny(tmp_path, count=4, duration_s=0.2, more=more)
+    more = (
+        "[vary.controller]\nk1_1_s = { uniform = [1.9, 2.0] }\n[converged]\nbelow_m = 50.0\nstatistics_after_s = 0.0\n"
+    )
+    study = tiny(tmp_path, count=4, duration_s=0.2, more=more, flight="paper")
     seen = []
     tuned = tune.tune(study, WISH, "python", generations=1, workers=1, progress=lambda *x: seen.append(x))
     vehicle = study.flight.vehicle.model_copy(
