@@ -1,10 +1,10 @@
 """Searches gains: certified ones with enough delay margin that fly a study's disturbances best.
 
-A candidate first passes the gates that every flight passes, and more delay margin than those ask for; only then it
-flies. All candidates fly the same flights, noise and gusts included, so that they differ by their gains alone. The
-search is scipy's differential evolution over the logarithms of the gains: it needs no derivatives and bears the jumps
-of a flight that is lost. What it finds is then flown, beside the gains of before, in flights that the search has not
-seen.
+A candidate first passes the gates that every flight passes, over the setpoints that the study's flight sends, and more
+delay margin than those ask for; only then it flies. All candidates fly the same flights, noise and gusts included, so
+that they differ by their gains alone. The search is scipy's differential evolution over the logarithms of the gains: it
+needs no derivatives and bears the jumps of a flight that is lost. What it finds is then flown, beside the gains of
+before, in flights that the search has not seen.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from companion.campaign.outcome import measured
 from companion.campaign.study import Study, from_json
 from companion.campaign.whole import fly
 from companion.config import Vehicle
-from companion.control.certificate import certify
-from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S, margins
+from companion.control.certificate import certify, disturbance_overcome
+from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S
 from companion.errors import CompanionError, RefusedError
-from companion.flight.loop_margins import timing
+from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, loop_margins
 
 FloatArray = NDArray[np.float64]
 
@@ -53,11 +53,16 @@ class Wish(NamedTuple):
     """What is asked of the gains."""
 
     delay_margin_s: float
-    """At least."""
+    """At least; below what every flight is asked for, that counts."""
     flights: int
     """Of the study that every candidate flies."""
     actuation_weight: float
     """How much a factor in the actuation counts beside the same factor in the error."""
+
+    @property
+    def least_s(self) -> float:
+        """The delay margin that counts [s]."""
+        return max(self.delay_margin_s, DELAY_MARGIN_MIN_S)
 
 
 class Score(NamedTuple):
@@ -102,6 +107,8 @@ class Tuned:
     """The gains of before in the same."""
     neighbours: list[Neighbour]
     evaluations: int
+    output: str
+    """What the law sends: the loop whose margins are judged."""
 
 
 def p_max_of(vehicle: Vehicle, gains: Mapping[str, float]) -> float:
@@ -135,11 +142,17 @@ def ranges(study: Study) -> list[tuple[float, float]]:
     return found
 
 
+def over_what(output: str) -> str:
+    """Which loop it is whose margins are judged, by the setpoints that close it."""
+    return "attitude setpoints" if output == "attitude" else "body rates"
+
+
 def score(study_json: str, gains: Mapping[str, float], wish: Wish, first: int, engine: str) -> Score:
     """Judge a gain set: the gates, then the flights from `first` on."""
     study = from_json(study_json)
     changes = {f"controller.{name}": value for name, value in gains.items()}
-    vehicle = study.case_with(first, changes).flight.vehicle
+    flight = study.case_with(first, changes).flight
+    vehicle, output = flight.vehicle, flight.output.by_law
     parameters = vehicle.parameters()
     found = certify(parameters.gains, parameters.model.drag)
     least = min(min(values) for values in found[:4])
@@ -147,14 +160,18 @@ def score(study_json: str, gains: Mapping[str, float], wish: Wish, first: int, e
     failure = found.failure()
     if failure is not None:
         return Score(2.0 * UNFIT - least, f"not certified: {failure}", least, math.nan, *nothing)
-    gap_s = vehicle.limits.state_gap_max_s
-    loop = margins(parameters, timing(vehicle), wish.delay_margin_s + DELAY_STRIDE_S, gap_s + 1.5 * INTERVAL_STRIDE_S)
-    if loop.delay_margin_s < wish.delay_margin_s:
-        short_s = wish.delay_margin_s - loop.delay_margin_s
-        words = f"a delay margin of {loop.delay_margin_s * 1e3:.1f} ms, {wish.delay_margin_s * 1e3:g} ms are asked for"
-        return Score(UNFIT * (1.0 + short_s), words, least, loop.delay_margin_s, *nothing)
+    overcome, ball = disturbance_overcome(parameters.gains), vehicle.limits.disturbance_max_m_s2
+    if ball > overcome:
+        words = f"a bounded position error that holds against {overcome:.2f} m/s^2, limits.disturbance_max_m_s2 is more"
+        return Score(UNFIT * ball / overcome, words, least, math.nan, *nothing)
+    gap_s, asked_s, over = vehicle.limits.state_gap_max_s, wish.least_s, over_what(output)
+    loop = loop_margins(vehicle, output, asked_s + DELAY_STRIDE_S, gap_s + 1.5 * INTERVAL_STRIDE_S)
+    if loop.delay_margin_s < asked_s:
+        words = f"a delay margin of {loop.delay_margin_s * 1e3:.1f} ms over {over}, {asked_s * 1e3:g} ms are asked for"
+        return Score(UNFIT * (1.0 + asked_s - loop.delay_margin_s), words, least, loop.delay_margin_s, *nothing)
     if loop.interval_max_s < gap_s:
-        words = f"a sampled loop that bears {loop.interval_max_s * 1e3:.0f} ms, limits.state_gap_max_s is longer"
+        bears = f"a sampled loop over {over} that bears {loop.interval_max_s * 1e3:.0f} ms"
+        words = f"{bears}, limits.state_gap_max_s is longer"
         return Score(UNFIT * (1.0 + gap_s - loop.interval_max_s), words, least, loop.delay_margin_s, *nothing)
     return _flown(study, changes, wish, first, engine, least, loop.delay_margin_s)
 
@@ -267,7 +284,7 @@ def tune(
         changed = [complete(vehicle, [gains[n] * (f if n == name else 1.0) for n in GAINS]) for name, f in steps]
         scores = judge(changed, 0, wish.flights)
     neighbours = [Neighbour(name, factor, s) for (name, factor), s in zip(steps, scores, strict=True)]
-    return Tuned(gains, before, at, fresh, fresh_before, neighbours, count)
+    return Tuned(gains, before, at, fresh, fresh_before, neighbours, count, study.flight.output.by_law)
 
 
 def _refuse_lost(vehicle: Vehicle, found: Score, which: str) -> None:
@@ -288,8 +305,9 @@ def words(tuned: Tuned, wish: Wish) -> list[str]:
     """Why these gains, in sentences."""
     s, fresh, old = tuned.search, tuned.fresh, tuned.fresh_before
     said = [
-        f"Certified: the smallest eigenvalue is {s.eigenvalue_min:.3g}, it must be above 0; the delay margin is at"
-        f" least {s.delay_margin_s * 1e3:.0f} ms, {wish.delay_margin_s * 1e3:g} ms are asked for.",
+        f"Certified: the smallest eigenvalue is {s.eigenvalue_min:.3g}, it must be above 0; the delay margin of"
+        f" the loop over {over_what(tuned.output)} is at least {s.delay_margin_s * 1e3:.0f} ms,"
+        f" {wish.least_s * 1e3:g} ms are asked for.",
         f"In {fresh.flights} flights that the search has not seen {fresh.converged} converge, with a position error of"
         f" {fresh.rms_m * 100:.2f} cm rms and {fresh.actuation_rad_s2:.2f} rad/s^2 of actuation (geometric means).",
     ]

@@ -63,6 +63,7 @@ def run(
         document = {
             "vehicle": found.flight.vehicle.name,
             "study": found.name,
+            "output": tuned.output,
             "gains": tuned.gains,
             "before": tuned.before,
             "gain_sets": tuned.evaluations,

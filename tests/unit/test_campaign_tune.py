@@ -6,9 +6,11 @@ import pytest
 
 from companion.campaign import tune
 from companion.campaign.study import load_study
+from companion.config import find
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.law import Gains
 from companion.errors import RefusedError
+from companion.flight.loop_margins import loop_margins
 from tests.unit.campaign_cases import tiny, tiny_file
 
 OWN = {"k1_1_s": 2.0, "k2": 3.0, "k3_1_s": 3.0, "k4_1_s": 4.0, "gamma_1_s3": 4.0, "position_error_max_m": 0.75}
@@ -35,6 +37,36 @@ def test_what_no_flight_would_be_allowed_with_is_not_flown(changes, margin_s, sa
     monkeypatch.setattr(tune, "fly", lambda *_: pytest.fail("it was flown"))
     found = tune.score(tiny(tmp_path).to_json(), OWN | changes, WISH._replace(delay_margin_s=margin_s), 0, "python")
     assert says in found.unfit and found.cost > tune.UNFIT * 0.99 and found.converged == 0
+
+
+def over(folder, kind):
+    """A study of the vehicle of PX4's SIH, flown with these setpoints."""
+    eight = find("eight", "flights").read_text().replace('vehicle = "bundled"', 'vehicle = "px4_sih"')
+    (folder / f"{kind}.toml").write_text(f'{eight}\n[output]\nkind = "{kind}"\n')
+    return tiny(folder, duration_s=0.2, flight=f"{kind}.toml")
+
+
+@pytest.mark.parametrize(("kind", "loop"), [("rates", "body rates"), ("attitude", "attitude setpoints")])
+def test_the_margins_are_those_of_the_loop_that_flies(kind, loop, tmp_path, monkeypatch):
+    """The same gains bear 9.4 ms over attitude setpoints, which the gate refuses, and more over body rates."""
+    monkeypatch.setattr(tune, "fly", lambda *_: pytest.fail("it was flown"))
+    study = over(tmp_path, kind)
+    vehicle = study.flight.vehicle
+    gains = {name: getattr(vehicle.controller, name) for name in OWN}
+    margin_s = loop_margins(vehicle, kind, 0.08, 0.2).delay_margin_s
+    found = tune.score(study.to_json(), gains, tune.Wish(margin_s + 0.002, 1, 0.3), 0, "python")
+    assert found.unfit.startswith(f"a delay margin of {margin_s * 1e3:.1f} ms over {loop}, ")
+    assert found.delay_margin_s == pytest.approx(margin_s, abs=1e-4)
+    if kind == "attitude":
+        least = tune.score(study.to_json(), gains, tune.Wish(0.0, 1, 0.3), 0, "python")
+        assert least.unfit.endswith("attitude setpoints, 10 ms are asked for")
+
+
+def test_a_bounded_error_that_does_not_hold_against_the_disturbance_is_not_flown(tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "fly", lambda *_: pytest.fail("it was flown"))
+    weak = OWN | {"position_error_max_m": 0.1}
+    found = tune.score(tiny(tmp_path).to_json(), weak, WISH, 0, "python")
+    assert found.cost > tune.UNFIT and "limits.disturbance_max_m_s2 is more" in found.unfit
 
 
 def test_better_tracking_costs_less_and_a_lost_flight_more(tmp_path):
@@ -83,7 +115,8 @@ def test_the_search_chooses_explains_and_compares(tmp_path, monkeypatch):
     assert 1.9 <= tuned.gains["k1_1_s"] <= 2.0 and tuned.search.delay_margin_s >= 0.01 and not tuned.search.unfit
     assert seen[-1][0] == tuned.evaluations >= 10 and math.isfinite(seen[-1][1].cost)
     said = tune.words(tuned, WISH)
-    assert said[0].startswith("Certified") and sum("a quarter higher" in s for s in said) == 5
+    assert said[0].startswith("Certified") and "the delay margin of the loop over body rates is at" in said[0]
+    assert sum("a quarter higher" in s for s in said) == 5
 
 
 def test_it_is_refused_when_nothing_is_allowed(tmp_path, monkeypatch):
