@@ -28,7 +28,7 @@ from companion.campaign.whole import fly
 from companion.config import Vehicle
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.sampled import DELAY_STRIDE_S, INTERVAL_STRIDE_S
-from companion.errors import CompanionError, RefusedError
+from companion.errors import CompanionError, InputError, RefusedError
 from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, loop_margins
 
 FloatArray = NDArray[np.float64]
@@ -228,10 +228,16 @@ def tune(
         progress: called after every generation with the number of gain sets judged, and the best one's score.
 
     Raises:
+        InputError: the study has no flights beside those of the search.
         RefusedError: no gain set is allowed, or none flies.
     """
     from scipy.optimize import differential_evolution
 
+    if study.total <= wish.flights:
+        raise InputError(
+            f"{study.source}: count: every candidate flies {wish.flights} flights, and of {study.total} none is left"
+            " that the search has not seen; give more, or lower --flights"
+        )
     text, vehicle = study.to_json(), study.flight.vehicle
     bounds: Any = [(math.log(low), math.log(high)) for low, high in ranges(study)]
     own = [max(getattr(vehicle.controller, name), 0.05) for name in GAINS]
@@ -277,7 +283,7 @@ def tune(
             )
         _refuse_lost(vehicle, at, "of the search")
         before = {name: float(getattr(vehicle.controller, name)) for name in gains}
-        many = min(4 * wish.flights, max(study.total - wish.flights, wish.flights))
+        many = min(4 * wish.flights, study.total - wish.flights)
         fresh, fresh_before = judge([gains, before], wish.flights, many)
         _refuse_lost(vehicle, fresh, "that the search has not seen")
         steps = list(itertools.product(GAINS, (STEP, 1.0 / STEP)))

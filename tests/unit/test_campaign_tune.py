@@ -9,7 +9,7 @@ from companion.campaign.study import load_study
 from companion.config import find
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.law import Gains
-from companion.errors import RefusedError
+from companion.errors import InputError, RefusedError
 from companion.flight.loop_margins import loop_margins
 from tests.unit.campaign_cases import tiny, tiny_file
 
@@ -75,6 +75,14 @@ def test_better_tracking_costs_less_and_a_lost_flight_more(tmp_path):
     assert (good.unfit, good.converged) == ("", 1) and 0.0 < good.rms_m < 0.2
     lost = tiny(tmp_path, duration_s=8.0, more="thrust_factor = { constant = 0.55 }\n").to_json()
     assert tune.score(lost, OWN, WISH, 0, "auto").cost > good.cost + tune.LOST
+
+
+def test_a_study_whose_flights_the_search_needs_all_is_refused_before_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "ProcessPoolExecutor", lambda *_, **__: pytest.fail("it was searched"))
+    with pytest.raises(
+        InputError, match="every candidate flies 2 flights, and of 2 none is left that the search has not"
+    ):
+        tune.tune(tiny(tmp_path, count=2), WISH._replace(flights=2), "python", generations=1, workers=1)
 
 
 def test_a_flight_that_is_lost_in_its_join_has_a_cost(tmp_path):
