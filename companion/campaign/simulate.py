@@ -28,7 +28,6 @@ from companion.errors import InputError, RefusedError
 from companion.flight.course import Course
 from companion.flight.phases import PHASE_INDEX, PHASE_NAMES, Phase
 from companion.flight.rows import StepTiming, control_row
-from companion.flight.surroundings import gate_course
 from companion.flight.tracker import Kernels, Tracker, TrackerStep
 from companion.frames import quat_from_yaw, radians
 from companion.link.telemetry import VehicleState
@@ -139,7 +138,7 @@ def fly_sampled(
         real: the vehicle that flies; None: what the flight's vehicle file says.
 
     Raises:
-        RefusedError: the flight diverges, or its course is not clear of the ground or a fence.
+        RefusedError: the flight diverges.
     """
     vehicle = flight.vehicle
     position, yaw = start_of(flight)
@@ -148,9 +147,7 @@ def fly_sampled(
     airframe = Airframe(
         sim, simulated_world(flight), seed=flight.world.seed, engine=compiled.engine, start=(position, yaw), px4=px4
     )
-    home = (0.0, 0.0, 0.0)
-    course = Course(trajectory, vehicle, position, yaw, home, flight.height_min_m)
-    gate_course(course, home, flight.height_min_m)
+    course = Course(trajectory, vehicle, position, yaw, (0.0, 0.0, 0.0), flight.height_min_m)
     tracker = Tracker(vehicle, flight.output.by_law, compiled)
     n_steps = max(1, round(sim.loop_rate_hz / vehicle.link.state_rate_hz))
     interval_us = n_steps * airframe.dt_us

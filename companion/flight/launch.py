@@ -20,8 +20,11 @@ from typing import Any
 from companion.campaign.predict import gate_prediction
 from companion.config import Flight
 from companion.errors import CompanionError, ExitCode
+from companion.flight.course import Course
 from companion.flight.preflight import gate_calibration, gate_gains, gate_place, gate_reference
+from companion.flight.surroundings import gate_course
 from companion.flight.tracker import kernels
+from companion.frames import radians
 from companion.link.vehicle_link import VehicleLink
 from companion.record.folder import create_flight_folder, write_configuration
 from companion.trajectory.load import of_flight, stored
@@ -57,6 +60,10 @@ def gate(flight: Flight) -> None:
         gate_gains(flight.vehicle, flight.output.by_law, brief=True)
     gate_reference(trajectory, flight.vehicle)
     gate_place(trajectory, flight.height_min_m)
+    if flight.start is not None:  # of any other it shows when the vehicle holds
+        home, start = (0.0, 0.0, 0.0), flight.start
+        where = start.position_m, radians(start.yaw_deg)
+        gate_course(Course(trajectory, flight.vehicle, *where, home, flight.height_min_m), home, flight.height_min_m)
     if by_law:
         gate_prediction(flight, trajectory, kernels("python"))
 
