@@ -10,7 +10,6 @@ import contextlib
 import errno
 import functools
 import importlib
-import os
 import signal
 import sys
 import traceback
@@ -127,8 +126,10 @@ def _interruptible(run: Callable[..., Any]) -> Callable[..., Any]:
 
 def _speak_into_nothing() -> None:
     """What is still to be said would fail once more when the interpreter ends."""
+    from companion.cli.steady_output import speak_into_nothing
+
     with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        speak_into_nothing(sys.stdout.fileno())
 
 
 def main(arguments: list[str] | None = None) -> int:

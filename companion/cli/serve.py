@@ -6,9 +6,11 @@ dies. What it takes is in docs/mavlink.md. Ctrl-C hands a flight over to Hold fi
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,6 +89,7 @@ def run(
 ) -> None:
     """Waits for commands and flies, until it is stopped."""
     from companion.accelerate import resolve
+    from companion.cli.steady_output import SteadyOutput
     from companion.ground.exposure import check_ground, ground_keys, open_vehicle_link
     from companion.ground.settings import GROUND_SYSTEMS, Settings
     from companion.ground.supervisor import Supervisor
@@ -115,16 +118,21 @@ def run(
         flight=_flight(vehicle, flight, controller_changes(controller, output)),
     )
 
-    def ready(control_pid: int, ground_pid: int) -> None:
-        facts = {"connect": connect, "ground": list(links), "control_pid": control_pid, "ground_pid": ground_pid}
-        if as_json:
-            print(json.dumps({"ready": True, **facts}), flush=True)
-        say(f"ready: vehicle link {connect}, ground links {', '.join(links)}", quiet=as_json)
+    with contextlib.ExitStack() as outputs:
+        documents = outputs.enter_context(SteadyOutput(sys.stdout))
+        told = outputs.enter_context(SteadyOutput(sys.stderr)) if as_json else documents
 
-    supervisor = Supervisor(settings, lambda line: say(f"  {line}", quiet=as_json), ready)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda number, _: supervisor.stop(number))
-    raise typer.Exit(supervisor.run())
+        def ready(control_pid: int, ground_pid: int) -> None:
+            facts = {"connect": connect, "ground": list(links), "control_pid": control_pid, "ground_pid": ground_pid}
+            if as_json:
+                documents.say(json.dumps({"ready": True, **facts}))
+            told.say(f"ready: vehicle link {connect}, ground links {', '.join(links)}")
+
+        supervisor = Supervisor(settings, lambda line: told.say(f"  {line}"), ready)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda number, _: supervisor.stop(number))
+        code = supervisor.run()
+    raise typer.Exit(code)
 
 
 def _usable(folder: Path, option: str) -> Path:

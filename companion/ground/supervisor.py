@@ -108,8 +108,8 @@ class Supervisor:
 
     Args:
         settings: of `companion serve`.
-        tell: gets lines for people.
-        ready: called once, when both work; with their process ids.
+        tell: gets lines for people; must neither raise nor wait, or it would end a flight or leave a process dead.
+        ready: called once, when both work; with their process ids; no more than `tell` may it raise or wait.
     """
 
     def __init__(self, settings: Settings, tell: Callable[[str], None], ready: Callable[[int, int], None]) -> None:

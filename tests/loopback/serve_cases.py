@@ -55,7 +55,7 @@ class Serving:
             (trajectories / f"{name}.toml").write_text(text)
         vehicle = folder / "serve_vehicle.toml"
         vehicle.write_text(tomlkit.dumps(make_flight().vehicle.model_dump(mode="json", exclude_none=True)))
-        self._command = [
+        self.command = [
             *(sys.executable, "-m", "companion", "serve", "--vehicle", str(vehicle), "--engine", "python"),
             *("--connect", f"udpin:127.0.0.1:{vehicle_port}", "--ground", f"udpin:127.0.0.1:{self.port}"),
             *("--folder", str(trajectories), "--flights", str(folder / "flights"), "--json"),
@@ -66,7 +66,7 @@ class Serving:
     def __enter__(self) -> Serving:
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
-                self._command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
+                self.command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
             )
         assert self.process.stdout is not None
         self.facts = json.loads(self.process.stdout.readline() or "{}")
