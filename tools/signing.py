@@ -192,6 +192,7 @@ def ground_link(key_file: str, key: SigningKey, messages: int, chance: random.Ra
     guard = open_signer(key_file)
     assert guard is not None
     place = GroundPort(f"udpin:127.0.0.1:{port}", lambda: 1, guard, GROUND_SYSTEMS)
+    place.open()
     payload = codec.encode_command_long(1, 191, 31010, 0, (1.0, *(0.0,) * 6))
     forger = Forger(key, 254, 190, COMMAND, payload, chance, (1, 7, 245, 255))
     with guard, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as voice:

@@ -45,16 +45,13 @@ class Peer:
 
 
 class GroundPort:
-    """One socket or line.
+    """One socket or line; nothing comes and nothing goes until it is opened.
 
     Args:
         connection: `udpin:127.0.0.1:14590`, `udpout:host:port` or `serial:/dev/ttyUSB0:57600`.
         system: asked for the system id that we send with.
         guard: verifies and signs.
         systems: system ids of the tools that are listened to; None: all.
-
-    Raises:
-        InputError, LinkError: it cannot be opened.
     """
 
     def __init__(
@@ -71,7 +68,7 @@ class GroundPort:
         self._systems = systems
         self._outdated = 0
         self._greeted_s = 0.0
-        self._transport: Transport = open_transport(connection)
+        self._transport: Transport | None = None
         self._system = system
         self._guard = guard
         self._formats = message_formats()
@@ -79,12 +76,20 @@ class GroundPort:
         self._leftover = b""
         self._seq = 0
         self._peers: dict[Address | None, Peer] = {}
-        if self._transport.stream or self._transport.fixed_peer is not None:
-            self._peers[self._transport.fixed_peer] = Peer(self, self._transport.fixed_peer)
+
+    def open(self) -> None:
+        """Opens it, for the first time or again.
+
+        Raises:
+            InputError, LinkError: it cannot be opened.
+        """
+        self._transport = transport = open_transport(self.connection)
+        if transport.stream or transport.fixed_peer is not None:
+            self._peers[transport.fixed_peer] = Peer(self, transport.fixed_peer)
 
     def fileno(self) -> int:
-        """File descriptor to wait on."""
-        return self._transport.fileno()
+        """File descriptor to wait on; -1 when it is not open."""
+        return -1 if self._transport is None else self._transport.fileno()
 
     @property
     def refusals(self) -> dict[str, int]:
@@ -103,20 +108,23 @@ class GroundPort:
             LinkError: the line is gone.
         """
         found: list[tuple[Frame, Peer]] = []
+        transport = self._transport
+        if transport is None:
+            return found
         for _ in range(_READS_MAX):
             try:
-                got = self._transport.read()
+                got = transport.read()
             except OSError:  # the network's report about something sent earlier
                 self.counters.unreachable += 1
                 continue
             if got is None:
                 break
-            found += self._parsed(*got)
+            found += self._parsed(transport, *got)
         return found
 
-    def _parsed(self, data: bytes, address: Address | None) -> list[tuple[Frame, Peer]]:
+    def _parsed(self, transport: Transport, data: bytes, address: Address | None) -> list[tuple[Frame, Peer]]:
         frames: list[Frame] = []
-        stream = self._transport.stream
+        stream = transport.stream
         data = self._leftover + data
         done = self._parser.parse(data, time.monotonic_ns(), frames, [], final=not stream)
         self._leftover = data[done:] if stream else b""
@@ -128,7 +136,7 @@ class GroundPort:
             if self._guard is not None:
                 self._greet(self._guard, address)
             return []
-        peer = self._peer(address if self._transport.fixed_peer is None else self._transport.fixed_peer)
+        peer = self._peer(address if transport.fixed_peer is None else transport.fixed_peer)
         return [(frame, peer) for frame in frames]
 
     def _greet(self, guard: FrameGuard, address: Address | None) -> None:
@@ -151,14 +159,17 @@ class GroundPort:
 
     def forget_silent(self, now_s: float) -> None:
         """Ends the reports to tools that have gone; those with a fixed address stay."""
-        if self._transport.stream or self._transport.fixed_peer is not None:
+        if self._transport is None or self._transport.stream or self._transport.fixed_peer is not None:
             return
         for address, peer in list(self._peers.items()):
             if now_s - peer.heard_s > PEER_SILENCE_S:
                 del self._peers[address]
 
     def send_to(self, msgid: int, payload: bytes, address: Address | None) -> None:
-        """Sends one message to one peer."""
+        """Sends one message to one peer; lost when it is not open."""
+        if self._transport is None:
+            self.counters.unreachable += 1
+            return
         crc_extra = self._formats[msgid].crc_extra
         raw = build_frame(msgid, payload, self._seq, self._system(), COMPANION_COMPONENT, crc_extra, self._guard)
         self._seq = (self._seq + 1) & 0xFF
@@ -171,8 +182,12 @@ class GroundPort:
         self.counters.send_dropped += not sent
 
     def close(self) -> None:
-        """Closes the socket or line."""
-        self._transport.close()
+        """Closes the socket or line, and forgets who was there and what had come in part; it may be opened again."""
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        self._peers.clear()
+        self._leftover = b""
 
 
 def _shown(address: Address) -> str:

@@ -22,6 +22,7 @@ from companion.ground.commands import CommandServer
 from companion.ground.hosting import Startable, file_server, open_store, parameter_server, tuned, tuning_of
 from companion.ground.links import GroundPort
 from companion.ground.messages import Severity, targets_of
+from companion.ground.ports import Ports
 from companion.ground.refusals import Guards, RefusalWatch
 from companion.ground.report import Report
 from companion.ground.reports import Reports
@@ -63,7 +64,7 @@ class Ground:
         report: to the supervisor.
 
     Raises:
-        InputError, LinkError: a ground link or the folder cannot be used.
+        InputError, LinkError: a ground link or the folder cannot be used; after a restart a ground link is waited for.
     """
 
     def __init__(self, settings: Settings, channel: Channel, report: Report) -> None:
@@ -72,15 +73,19 @@ class Ground:
         self._standing = Standing()
         self._systems = frozenset(settings.ground_systems)
         self._guards = Guards()
-        self._ports = [
+        self._links = [
             GroundPort(connection, self._system, self._guards.of(key), self._systems)
             for connection, key in settings.ground_links
         ]
         self._vehicle = VehicleLink(channel)
-        self._reports = Reports(self._ports, self._vehicle, lambda: self._standing)
+        self._reports = Reports(self._links, self._vehicle, lambda: self._standing)
         self._reports.refused = lambda: sum(sum(reasons.values()) for reasons in self._refusals().values())
-        for port in self._ports:
-            port.greeting = self._reports.heartbeat
+        for link in self._links:
+            link.greeting = self._reports.heartbeat
+        self._poll = select.poll()
+        self._poll.register(channel.fileno(), select.POLLIN)
+        self._ports = Ports(self._links, self._poll, self._say_verdict)
+        self._ports.open(all_of_them=not settings.again)
         tuning = tuning_of(settings)
         store = open_store(tuned(settings, tuning.overrides))
         if store.problem:
@@ -106,30 +111,24 @@ class Ground:
 
     def run(self) -> int:
         """Until told to stop, or until the supervisor is gone."""
-        poll = select.poll()
-        poll.register(self._channel.fileno(), select.POLLIN)
-        for port in self._ports:
-            poll.register(port.fileno(), select.POLLIN)
         self._report.send(ready=True)
         ticked_s = 0.0
         while not self._stopping:
-            poll.poll(WAIT_MS)
+            self._poll.poll(WAIT_MS)
             now_s = time.monotonic()
             for item in self._channel.receive(_ITEMS_MAX):
                 if isinstance(item, Copy):
                     self._on_copy(item, now_s)
                 elif isinstance(item, dict):
                     self._on_note(item, now_s)
-            for port in self._ports:
-                for frame, peer in port.receive():  # a line that is gone ends this process, the next one opens it again
-                    self._dispatch(frame, peer, now_s)
+            for frame, peer in self._ports.receive():
+                self._dispatch(frame, peer, now_s)
             if now_s - ticked_s >= TICK_S:
                 ticked_s = now_s
                 self._tick(now_s)
         self._files.close()
         self._parameters.close()
-        for port in self._ports:
-            port.close()
+        self._ports.close()
         self._guards.close()
         return int(ExitCode.DONE)
 
@@ -137,8 +136,7 @@ class Ground:
         for service in self._services:
             self._guarded(service, lambda service=service: service.tick(now_s))
         self._reports.tick(now_s)
-        for port in self._ports:
-            port.forget_silent(now_s)
+        self._ports.tick(now_s)
         self._watch.tick(now_s, self._refusals())
         if self._report.closed:
             self._stopping = True
@@ -158,7 +156,7 @@ class Ground:
     def _refusals(self) -> dict[str, dict[str, int]]:
         """What was refused so far, by link and reason."""
         radio = {**self._standing.refused, "through_the_radio": self._copied.other_system + self._copied.bad_signature}
-        return {"the vehicle link": radio, **{port.connection: port.refusals for port in self._ports}}
+        return {"the vehicle link": radio, **{port.connection: port.refusals for port in self._links}}
 
     def _dispatch(self, frame: Frame, link: GroundLink, now_s: float) -> None:
         targets = targets_of(frame.msgid, frame.payload)

@@ -41,6 +41,9 @@ class Settings:
     """File with the key of each ground link; none where there are fewer."""
     ground_systems: tuple[int, ...] = GROUND_SYSTEMS
     """System ids of the ground tools that may use the companion, by a ground link or through the autopilot's radio."""
+    again: bool = False
+    """Told by the supervisor: the process has worked before and was started again. What it could have then and cannot
+    have now is away for a while and not mistyped."""
 
     @property
     def link(self) -> VehicleLink:

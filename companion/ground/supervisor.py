@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, Final
 
 from companion.errors import CompanionError, ExitCode
@@ -54,8 +55,9 @@ class _Child:
         ours.setblocking(False)
         with theirs:
             descriptors = (self._end.fileno(), theirs.fileno())
+            settings = replace(self._settings, again=self.ever_ready)
             self.process = subprocess.Popen(
-                [sys.executable, "-m", self._module, self._settings.as_json(), *map(str, descriptors)],
+                [sys.executable, "-m", self._module, settings.as_json(), *map(str, descriptors)],
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 stdout=sys.stderr,

@@ -24,6 +24,7 @@ class Host:
         self.port = free_udp_port()
         self.texts: list[str] = []
         self._ground = GroundPort(f"udpin:127.0.0.1:{self.port}", lambda: 1)
+        self._ground.open()
         self.server = ParameterServer(
             Tuning(load_vehicle("bundled")),
             folder / "parameters.toml",
