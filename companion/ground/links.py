@@ -1,7 +1,7 @@
 """The ground links: ports and lines at which ground tools find the companion.
 
-A `udpin` port talks to everybody who sent a valid frame to it lately; `udpout` and `serial` have one peer each. Every
-peer is a `GroundLink` of its own, so that an answer goes where the question came from.
+A `udpin` port talks to everybody who sent a valid frame to it lately, with a key a signed one; `udpout` and `serial`
+have one peer each. Every peer is a `GroundLink` of its own, so that an answer goes where the question came from.
 """
 
 from __future__ import annotations
@@ -13,7 +13,16 @@ from typing import Final
 from companion.errors import LinkError
 from companion.link import codec
 from companion.link.codec import message_formats
-from companion.link.framing import Frame, FrameGuard, FrameParser, LinkCounters, build_frame, refusals
+from companion.link.framing import (
+    MAGIC_V2,
+    SIGNED,
+    Frame,
+    FrameGuard,
+    FrameParser,
+    LinkCounters,
+    build_frame,
+    refusals,
+)
 from companion.link.transport import Address, Transport, open_transport
 from companion.link.wire import COMPANION_COMPONENT
 
@@ -128,6 +137,9 @@ class GroundPort:
         data = self._leftover + data
         done = self._parser.parse(data, time.monotonic_ns(), frames, [], final=not stream)
         self._leftover = data[done:] if stream else b""
+        if self._guard is not None:
+            # What may come unsigned (a radio's own report) is of no use here, and anybody may have sent it.
+            frames = [frame for frame in frames if frame.raw[0] == MAGIC_V2 and frame.raw[2] == SIGNED]
         if self._systems is not None and frames:
             heard = len(frames)
             frames = [frame for frame in frames if frame.sysid in self._systems]
