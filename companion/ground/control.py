@@ -67,6 +67,9 @@ class Control:
         settings: of `companion serve`.
         channel: to the ground process.
         report: to the supervisor.
+
+    Raises:
+        InputError: the file with what was changed from the ground cannot be used.
     """
 
     def __init__(self, settings: Settings, channel: Channel, report: Report) -> None:
@@ -414,10 +417,10 @@ def main() -> int:
     report = Report(socket.socket(fileno=int(report_fd)))
     channel = Channel(socket.socket(fileno=int(channel_fd)))
     channel.discard()
-    control = Control(Settings.from_json(settings), channel, report)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: control.stop())
     try:
+        control = Control(Settings.from_json(settings), channel, report)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: control.stop())
         return control.run()
     except CompanionError as error:
         report.send(error=str(error))

@@ -88,6 +88,26 @@ def test_a_folder_in_use_ends_it_at_once(
     assert f"--folder {folder}: another `companion serve` uses it; give each its own" in capfd.readouterr().err
 
 
+def test_a_parameters_file_that_cannot_be_used_ends_it_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "trajectories" / ".parameters-paper.toml"
+    file.parent.mkdir()
+    file.write_text("controller = 3\n")
+    free = [f"udpin:127.0.0.1:{free_udp_port()}" for _ in range(2)]
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        arguments = ["--engine", "python", "--connect", free[0], "--ground", free[1]]
+        assert main(["serve", "--vehicle", "paper", *arguments]) == 2
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    error = capfd.readouterr().err
+    assert str(file) in error
+    assert error.count("\n") == 1
+
+
 def test_the_supervisor_killed(tmp_path: Path) -> None:
     """The flight goes on to its end; then nothing is left."""
     with serving(tmp_path, ("short",)) as (serve, stand):
