@@ -85,22 +85,50 @@ def encode_ack(
 
 
 def encode_texts(severity: int, text: str, identity: int) -> Iterator[bytes]:
-    """STATUSTEXT, as many as the text takes.
+    """STATUSTEXT, as many as the text takes. No chunk ends within a character: other readers decode each by itself.
 
     Args:
         severity: MAV_SEVERITY.
         text: for people.
         identity: 1..65535, another one for every text; a short text goes without.
     """
-    data = text.encode("utf-8", "replace")
-    if len(data) <= TEXT_BYTES:
-        yield codec.STATUSTEXT_LAYOUT.pack(severity, data, 0, 0)
+    chunks = _chunks(text.encode("utf-8", "replace"))
+    if len(chunks) == 1:
+        yield codec.STATUSTEXT_LAYOUT.pack(severity, chunks[0], 0, 0)
         return
-    chunks = [data[at : at + TEXT_BYTES] for at in range(0, len(data), TEXT_BYTES)]
     if len(chunks[-1]) == TEXT_BYTES:
         chunks.append(b"")  # the last one must have a NUL in it
     for number, chunk in enumerate(chunks[:256]):
         yield codec.STATUSTEXT_LAYOUT.pack(severity, chunk, identity, number)
+
+
+def _chunks(left: bytes) -> list[bytes]:
+    """A text in pieces of 50 bytes, the last one of 50 or less, that end with a whole character each.
+
+    A shorter piece would say that the text ends with it. So a character that a border would split is moved behind it by
+    more space at the last blank before, and is given up for a "?" where there is no blank.
+    """
+    chunks = []
+    while len(left) > TEXT_BYTES:
+        begin, end = TEXT_BYTES, TEXT_BYTES
+        while _continues(left[begin]):
+            begin -= 1
+        while end < len(left) and _continues(left[end]):
+            end += 1
+        if begin < TEXT_BYTES:
+            blank = left.rfind(b" ", 0, begin)
+            if blank < 0:
+                left = left[:begin] + b"?" + left[end:]
+                continue
+            left = left[:blank] + b" " * (TEXT_BYTES - begin) + left[blank:]
+        chunks.append(left[:TEXT_BYTES])
+        left = left[TEXT_BYTES:]
+    return [*chunks, left]
+
+
+def _continues(byte: int) -> bool:
+    """Whether a byte of UTF-8 is a further one of its character."""
+    return byte & 0xC0 == 0x80
 
 
 def encode_named_value(time_boot_ms: int, name: str, value: float) -> bytes:

@@ -164,7 +164,8 @@ class StatusText(NamedTuple):
 
     severity: int
     """MAV_SEVERITY: 0 emergency ... 7 debug."""
-    text: str
+    text: bytes
+    """UTF-8 up to the first NUL; a character may begin in one chunk and end in the next one."""
     complete: bool
     """Whether the text ends in this chunk."""
     id: int
@@ -288,7 +289,7 @@ def decode_param_error(payload: bytes) -> ParamError:
 def decode_statustext(payload: bytes) -> StatusText:
     """STATUSTEXT."""
     severity, text, identity, chunk = STATUSTEXT_LAYOUT.unpack_from(filled(payload, STATUSTEXT_LAYOUT.size))
-    return StatusText(severity, _text(text), identity == 0 or b"\0" in text, identity, chunk)
+    return StatusText(severity, text.split(b"\0", 1)[0], identity == 0 or b"\0" in text, identity, chunk)
 
 
 def decode_autopilot_version(payload: bytes) -> AutopilotVersionMessage:

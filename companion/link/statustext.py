@@ -32,7 +32,7 @@ class _Partial:
     def __init__(self, started_s: float, severity: int) -> None:
         self.started_s = started_s
         self.severity = severity
-        self.chunks: dict[int, str] = {}
+        self.chunks: dict[int, bytes] = {}
         self.last_chunk: int | None = None
 
     def whole(self) -> bool:
@@ -42,8 +42,8 @@ class _Partial:
     def text(self) -> str:
         """The text, with "..." where a chunk is missing."""
         last = max(self.chunks) if self.last_chunk is None else self.last_chunk
-        missing_end = "" if self.last_chunk is not None else "..."
-        return "".join(self.chunks.get(index, "...") for index in range(last + 1)) + missing_end
+        missing_end = b"" if self.last_chunk is not None else b"..."
+        return _readable(b"".join(self.chunks.get(index, b"...") for index in range(last + 1)) + missing_end)
 
 
 class StatusTexts:
@@ -57,7 +57,7 @@ class StatusTexts:
     def add(self, message: StatusText, now_s: float) -> None:
         """Take one message."""
         if message.id == 0:
-            self.texts.append(Announcement(now_s, message.severity, message.text))
+            self.texts.append(Announcement(now_s, message.severity, _readable(message.text)))
             return
         partial = self._partial.setdefault(message.id, _Partial(now_s, message.severity))
         partial.chunks[message.chunk_seq] = message.text
@@ -83,3 +83,8 @@ class StatusTexts:
         """Warnings and worse that came within this time, oldest first, each once."""
         found = [a.text for a in self.texts if from_s <= a.at_s <= to_s and a.severity <= WARNING and a.text]
         return list(dict.fromkeys(found))
+
+
+def _readable(text: bytes) -> str:
+    """A whole text; bytes that are none become replacement characters."""
+    return text.decode("utf-8", errors="replace")

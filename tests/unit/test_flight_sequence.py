@@ -236,7 +236,7 @@ def test_refusal_waits_for_the_autopilots_words() -> None:
     script.ops.asked[-1].end(Result.TEMPORARILY_REJECTED, script.now_s)
     script.run(0.1)
     assert script.sequence.ending is None
-    script.ops.texts.add(codec.StatusText(2, "Arming denied: high wind", True, 0, 0), script.now_s)
+    script.ops.texts.add(codec.StatusText(2, b"Arming denied: high wind", True, 0, 0), script.now_s)
     script.ops.at_once = True
     ended = script.ends()
     assert ended.cause is Cause.REFUSED

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from companion.ground.channel import Channel, Copy, Outgoing
 from companion.ground.messages import (
@@ -64,15 +66,47 @@ def test_version() -> None:
     assert message.capabilities & LIBRARY.MAV_PROTOCOL_CAPABILITY_FTP
 
 
-@pytest.mark.parametrize("text", ["short", "x" * 50, "x" * 51, "y" * 100, "z" * 149, "å" * 60])
+@pytest.mark.parametrize("text", ["short", "x" * 50, "x" * 51, "y" * 100, "z" * 149, "å" * 60, "å" * 25])
 def test_texts_of_any_length_arrive_whole(text: str) -> None:
     texts = StatusTexts()
     for payload in encode_texts(Severity.WARNING, text, 9):
         decoded(codec.STATUSTEXT, payload)
         texts.add(codec.decode_statustext(payload), 0.0)
-    if text.isascii():
-        assert [said.text for said in texts.texts] == [text]
+    assert [said.text for said in texts.texts] == [text]
     assert [said.severity for said in texts.texts] == [4]
+
+
+@pytest.mark.parametrize(
+    ("text", "arrives"),
+    [
+        ("a file " + "x" * 42 + "å is refused", "a file  " + "x" * 42 + "å is refused"),
+        ("a file " + "x" * 41 + "→ is refused", "a file   " + "x" * 41 + "→ is refused"),
+        ("x" * 49 + "å is refused", "x" * 49 + "? is refused"),
+        ("x" * 49 + "å", "x" * 49 + "?"),
+        ("x" * 48 + "→→ refused", "x" * 48 + "?? refused"),
+    ],
+)
+def test_a_character_on_the_border_of_two_chunks_is_moved_or_given_up(text: str, arrives: str) -> None:
+    texts = StatusTexts()
+    for payload in encode_texts(Severity.WARNING, text, 9):
+        texts.add(codec.decode_statustext(payload), 0.0)
+    assert [said.text for said in texts.texts] == [arrives]
+
+
+@settings(deadline=None)
+@given(st.text(st.sampled_from("ab å→🚁"), max_size=400))
+def test_every_chunk_of_a_text_can_be_read_by_itself(text: str) -> None:
+    """As pymavlink and ground stations do; only the last one may say that the text ends."""
+    chunks = [codec.decode_statustext(payload) for payload in encode_texts(Severity.INFO, text, 9)]
+    read = "".join(chunk.text.decode("utf-8", "strict") for chunk in chunks)
+    assert [chunk.complete for chunk in chunks] == [False] * (len(chunks) - 1) + [True]
+    given_up = [wanted if found == "?" else found for found, wanted in zip(*squeezed(read, text), strict=True)]
+    assert "".join(given_up) == squeezed(text)[0]
+
+
+def squeezed(*texts: str) -> list[str]:
+    """Without blanks."""
+    return [text.replace(" ", "") for text in texts]
 
 
 def test_commands_are_read_as_pymavlink_writes_them() -> None:

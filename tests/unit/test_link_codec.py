@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from companion.link import codec
 from companion.link.framing import Frame, FrameParser, LinkCounters, build_frame
+from companion.link.statustext import StatusTexts
 
 LIBRARY = codec.dialect()
 FORMATS = codec.message_formats()
@@ -186,9 +187,22 @@ def test_a_parameter_of_unknown_type_has_no_value():
 
 def test_statustext_and_its_chunks():
     whole = LIBRARY.MAVLink_statustext_message(3, b"Arming denied", 0, 0)
-    assert codec.decode_statustext(parsed(library_frame(whole)).payload) == (3, "Arming denied", True, 0, 0)
+    assert codec.decode_statustext(parsed(library_frame(whole)).payload) == (3, b"Arming denied", True, 0, 0)
     chunk = LIBRARY.MAVLink_statustext_message(3, b"x" * 50, 12, 1)
-    assert codec.decode_statustext(parsed(library_frame(chunk)).payload) == (3, "x" * 50, False, 12, 1)
+    assert codec.decode_statustext(parsed(library_frame(chunk)).payload) == (3, b"x" * 50, False, 12, 1)
+
+
+def test_a_character_may_lie_on_the_border_of_two_chunks():
+    """As PX4 and others cut a text: every 50 bytes."""
+    text = "x" * 49 + "å" + "y" * 48 + "→"
+    data = text.encode()
+    texts = StatusTexts()
+    for number in range(3):
+        message = LIBRARY.MAVLink_statustext_message(3, data[50 * number : 50 * (number + 1)], 12, number)
+        texts.add(codec.decode_statustext(parsed(library_frame(message)).payload), 0.0)
+    assert [said.text for said in texts.texts] == [text]
+    texts.add(codec.decode_statustext(struct.pack("<B50s", 3, b"no text: \xff")), 0.0)
+    assert texts.texts[-1].text == "no text: \ufffd"
 
 
 def test_autopilot_version_comes_back():
