@@ -24,6 +24,9 @@ EPOCH_S: Final = 1_420_070_400
 NEW_STREAM_LATE: Final = 60 * UNITS_PER_S
 """How far behind the newest time the first frame of a stream may be."""
 TIME_END: Final = 1 << 48
+"""Signing times are below this, in the year 2104."""
+TIME_LATEST: Final = TIME_END - 365 * 24 * 3600 * UNITS_PER_S
+"""Nobody's time is taken over beyond this: a year must be left to sign in, or one broken clock would end the key."""
 STREAMS_MAX: Final = 64
 """Senders that are kept apart; only who has the key can make one."""
 
@@ -74,7 +77,7 @@ class SigningCounters:
     replayed: int = 0
     """Refused: not newer than what its stream has sent before."""
     stale: int = 0
-    """Refused: the first of its stream, and too old."""
+    """Refused: the first of its stream, and too old; or so late that hardly any time would be left to sign in."""
     too_many: int = 0
     """Refused: of one stream more than can be kept apart."""
 
@@ -152,11 +155,15 @@ class Signer:
         return max(self.times.newest, self._zero + time.monotonic_ns() // _NS_PER_UNIT)
 
     def sign(self, unsigned: bytes) -> bytes:
-        """The 13 bytes that end a frame which has the signed flag set."""
+        """The 13 bytes that end a frame which has the signed flag set.
+
+        At the end of all times it goes on with the last one: others refuse that, and whoever sends lives on.
+        """
         times = self.times
         newest = times.newest + 1
         clock = self._zero + time.monotonic_ns() // _NS_PER_UNIT
-        times.newest = newest = newest if newest > clock else clock
+        newest = newest if newest > clock else clock
+        times.newest = newest = newest if newest < TIME_END else TIME_END - 1
         tail = self._link + newest.to_bytes(_TIME_BYTES, "little")
         digest = self._hash.copy()
         digest.update(unsigned + tail)
@@ -179,6 +186,9 @@ class Signer:
         times = self.times
         stream = raw[-13] << 16 | raw[6] << 8 | raw[5]
         at = int.from_bytes(raw[-12:-6], "little")
+        if at > TIME_LATEST:
+            counters.stale += 1
+            return False
         last = times.streams.get(stream)
         if last is None:
             if not self._begins(at):

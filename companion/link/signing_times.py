@@ -176,6 +176,7 @@ class Place:
         Raises:
             OSError: it cannot be written.
         """
+        newest, reserved = min(newest, TIME_END), min(reserved, TIME_END)  # what is later would count as damaged
         kept = {
             **{"newest": newest, "reserved": reserved, "ended": ended, "link_id": times.link_id},
             "streams": {str(stream): last for stream, last in times.streams.copy().items()},

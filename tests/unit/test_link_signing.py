@@ -16,6 +16,8 @@ from companion.link.signing import (
     RADIO_STATUS,
     SETUP_SIGNING,
     STREAMS_MAX,
+    TIME_END,
+    TIME_LATEST,
     UNITS_PER_S,
     UNSIGNED_ALLOWED,
     Signer,
@@ -210,6 +212,24 @@ def test_a_time_that_is_ahead_is_taken_over():
     parsed(signed(At(KEY, 2 * 10**12)), guard)
     assert guard.now() == 2 * 10**12 + 1
     assert int.from_bytes(guard.sign(b"x")[1:7], "little") == 2 * 10**12 + 2
+
+
+def test_a_time_near_the_end_of_all_times_is_not_taken_over():
+    guard = At(KEY, 10**12)
+    for known in (False, True):  # a new stream, and one that was heard
+        before = guard.now()
+        assert not parsed(signed(At(KEY, TIME_END - 3)), guard)
+        assert not parsed(signed(At(KEY, TIME_LATEST)), guard)  # signs with the time after that
+        assert (guard.now(), bool(guard.times.streams)) == (before, known)
+        assert parsed(signed(At(KEY, 10**12 + known)), guard)
+    assert (guard.counters.stale, guard.outdated) == (4, 4)
+    assert parsed(signed(At(KEY, TIME_LATEST - 1)), guard)
+
+
+def test_at_the_end_of_all_times_signing_goes_on():
+    signer = At(KEY, TIME_END - 2)
+    times = [int.from_bytes(signer.sign(b"x")[1:7], "little") for _ in range(3)]
+    assert times == [TIME_END - 1] * 3
 
 
 def test_many_streams_forget_the_silent_ones_only():

@@ -13,7 +13,7 @@ from companion.errors import InputError
 from companion.link import codec, signing_times
 from companion.link.framing import FrameParser, LinkCounters, build_frame
 from companion.link.key_file import new_key
-from companion.link.signing import UNITS_PER_S, Signer, SigningKey, SigningTimes, stream_of, time_now
+from companion.link.signing import TIME_END, UNITS_PER_S, Signer, SigningKey, SigningTimes, stream_of, time_now
 from companion.link.signing_times import RESERVE_S, KeptSigner, Place, open_signer, state_folder
 
 KEY = SigningKey(bytes(range(32)))
@@ -108,6 +108,23 @@ def test_everything_used_is_covered_by_what_is_on_the_disk(tmp_path):
         kept = json.loads((tmp_path / "0.json").read_text())
         assert kept["reserved"] > sent_at(signer)
         assert kept["streams"] == {str(stream_of(1, 1, 0)): signer.times.streams[stream_of(1, 1, 0)]}
+
+
+def test_a_time_at_the_end_of_all_times_can_be_read_again(tmp_path):
+    with opened(tmp_path) as signer:
+        signer.times.newest = TIME_END - 2
+        signer.keep()
+        assert signer.problem == ""
+    with opened(tmp_path) as signer:
+        assert sent_at(signer) == TIME_END - 1
+
+
+def test_a_broken_clock_of_somebody_with_the_key_ends_nothing(tmp_path):
+    with opened(tmp_path) as signer:
+        assert not accepts(signer, heartbeat(vehicle(TIME_END - 2)))
+        assert sent_at(signer) < time_now() + UNITS_PER_S
+    with opened(tmp_path) as signer:
+        assert sent_at(signer) < time_now() + UNITS_PER_S
 
 
 def test_the_thread_reserves_again_when_time_jumps(tmp_path, monkeypatch):
