@@ -23,6 +23,7 @@ from companion.link.framing import (
     build_frame,
     refusals,
 )
+from companion.link.line import LineReader
 from companion.link.transport import Address, Transport, open_transport
 from companion.link.wire import COMPANION_COMPONENT
 
@@ -82,7 +83,8 @@ class GroundPort:
         self._guard = guard
         self._formats = message_formats()
         self._parser = FrameParser(self._formats, self.counters, guard)
-        self._leftover = b""
+        self._line: LineReader | None = None
+        """Of a serial line, while it is open."""
         self._seq = 0
         self._peers: dict[Address | None, Peer] = {}
 
@@ -93,6 +95,7 @@ class GroundPort:
             InputError, LinkError: it cannot be opened.
         """
         self._transport = transport = open_transport(self.connection)
+        self._line = LineReader(self._parser) if transport.stream else None
         if transport.stream or transport.fixed_peer is not None:
             self._peers[transport.fixed_peer] = Peer(self, transport.fixed_peer)
 
@@ -127,16 +130,27 @@ class GroundPort:
                 self.counters.unreachable += 1
                 continue
             if got is None:
+                if self._line is not None:
+                    found += self._rested(self._line)
                 break
-            found += self._parsed(transport, *got)
+            found += self._parsed(*got)
         return found
 
-    def _parsed(self, transport: Transport, data: bytes, address: Address | None) -> list[tuple[Frame, Peer]]:
+    def _parsed(self, data: bytes, address: Address | None) -> list[tuple[Frame, Peer]]:
         frames: list[Frame] = []
-        stream = transport.stream
-        data = self._leftover + data
-        done = self._parser.parse(data, time.monotonic_ns(), frames, [], final=not stream)
-        self._leftover = data[done:] if stream else b""
+        if self._line is None:
+            self._parser.parse(data, time.monotonic_ns(), frames, [])
+        else:
+            self._line.take(data, time.monotonic_ns(), frames, [])
+        return self._heard(frames, address)
+
+    def _rested(self, line: LineReader) -> list[tuple[Frame, Peer]]:
+        """What waited behind an unfinished frame, if a line is silent now."""
+        frames: list[Frame] = []
+        line.rest(time.monotonic_ns(), frames, [])
+        return self._heard(frames, None) if frames else []
+
+    def _heard(self, frames: list[Frame], address: Address | None) -> list[tuple[Frame, Peer]]:
         if self._guard is not None:
             # What may come unsigned (a radio's own report) is of no use here, and anybody may have sent it.
             frames = [frame for frame in frames if frame.raw[0] == MAGIC_V2 and frame.raw[2] == SIGNED]
@@ -148,7 +162,9 @@ class GroundPort:
             if self._guard is not None:
                 self._greet(self._guard, address)
             return []
-        peer = self._peer(address if transport.fixed_peer is None else transport.fixed_peer)
+        transport = self._transport
+        fixed = None if transport is None else transport.fixed_peer
+        peer = self._peer(address if fixed is None else fixed)
         return [(frame, peer) for frame in frames]
 
     def _greet(self, guard: FrameGuard, address: Address | None) -> None:
@@ -199,7 +215,7 @@ class GroundPort:
             self._transport.close()
             self._transport = None
         self._peers.clear()
-        self._leftover = b""
+        self._line = None
 
 
 def _shown(address: Address) -> str:

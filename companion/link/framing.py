@@ -1,7 +1,8 @@
 """MAVLink frames: finding them in bytes, checking them, building them.
 
 A parser takes whole datagrams or pieces of a serial stream, version 1 and 2, signed or not. It trusts a length only
-after the checksum: behind a bad frame the search goes on at the next byte, so one corrupted byte costs one frame.
+after the checksum: behind a bad frame the search goes on at the next byte, so one corrupted byte costs one frame. The
+length of a message that is unknown can only be judged by what is around it: a datagram has an end, a stream has not.
 """
 
 from __future__ import annotations
@@ -122,6 +123,13 @@ def _length(data: bytes, at: int, end: int) -> int:
     return length if at + length <= end else _UNFINISHED
 
 
+def _msgid(data: bytes, at: int) -> int:
+    """Number of the message whose whole frame begins at `at`."""
+    if data[at] == MAGIC_V2:
+        return data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16
+    return data[at + 5]
+
+
 class FrameParser:
     """Turns received bytes into frames and counts what is bad."""
 
@@ -141,14 +149,15 @@ class FrameParser:
             wall_ns: when it arrived, `time.monotonic_ns()`.
             frames: receives the good frames.
             unknown: receives, raw, the frames of messages that we do not know, for the traffic log.
-            final: nothing will be added to `data` (a datagram). Otherwise an unfinished frame at its end is left over.
+            final: nothing will be added to `data` (a datagram). Otherwise an unfinished frame at its end is left over,
+                and one of an unknown message that nothing shows to be one yet.
         """
+        if not final:
+            return self._parse_stream(data, wall_ns, frames, unknown)
         at = 0
         end = len(data)
         while at < end:
             length = _length(data, at, end)
-            if length == _UNFINISHED and not final:
-                break
             if length > 0:
                 raw = data if length == end else data[at : at + length]
                 following = data[at + length] if at + length < end else -1
@@ -159,6 +168,90 @@ class FrameParser:
             to = end if found is None else found.start()
             self._counters.garbage_bytes += to - at
             at = to
+        return at
+
+    def _parse_stream(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> int:
+        """The same for a stream, where the data end anywhere."""
+        at = 0
+        end = len(data)
+        while at < end:
+            length = _length(data, at, end)
+            if length == _UNFINISHED:
+                break
+            if length > 0:
+                following = self._following(data, at, at + length)
+                if following == _UNFINISHED:
+                    break
+                if self._take(data[at : at + length], following, wall_ns, frames, unknown):
+                    at += length
+                    continue
+            found = _ANY_MAGIC.search(data, at + 1)
+            to = end if found is None else found.start()
+            self._counters.garbage_bytes += to - at
+            at = to
+        return at
+
+    def _following(self, data: bytes, at: int, to: int) -> int:
+        """The byte behind a candidate, 0 when it is no frame as there is a good one in it or none behind it.
+
+        Only what is unknown is judged so. `_UNFINISHED`: more must come first.
+        """
+        if _msgid(data, at) in self._formats:
+            return 0
+        if self._find_good(data, at + 1, to) >= 0:
+            return 0
+        end = len(data)
+        if to == end:
+            return _UNFINISHED
+        length = _length(data, to, end)
+        if length == _UNFINISHED:
+            return _UNFINISHED
+        good = length > 0 and (_msgid(data, to) not in self._formats or self._find_good(data, to, to + 1) == to)
+        return data[to] if good else 0
+
+    def _find_good(self, data: bytes, start: int, to: int) -> int:
+        """Where a whole frame with a right checksum begins in this range, -1 when none does. Nothing is counted."""
+        end = len(data)
+        found = _ANY_MAGIC.search(data, start, to)
+        while found is not None:
+            at = found.start()
+            length = _length(data, at, end)
+            if length > 0:
+                known = self._formats.get(_msgid(data, at))
+                stop = at + (10 if data[at] == MAGIC_V2 else 6) + data[at + 1]
+                if known is not None and (
+                    mcrf4xx(data[at + 1 : stop] + _CRC_EXTRA[known.crc_extra]) == data[stop] | data[stop + 1] << 8
+                ):
+                    return at
+            found = _ANY_MAGIC.search(data, at + 1, to)
+        return -1
+
+    def settle(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> int:
+        """A stream has fallen silent: append the good frames behind an unfinished one that was left over.
+
+        An unfinished frame without any behind it stays: it holds nothing back, and its rest may still come.
+
+        Args:
+            data: what `parse` has left over.
+            wall_ns: when the last of it arrived, `time.monotonic_ns()`.
+            frames: receives the good frames.
+            unknown: receives the frames of unknown messages.
+
+        Returns:
+            How many bytes are done with.
+        """
+        at = 0
+        end = len(data)
+        while at < end:
+            good = self._find_good(data, at + 1, end)
+            if good >= 0:
+                self.parse(data[at:good], wall_ns, frames, unknown)
+                at = good + self._parse_stream(data[good:], wall_ns, frames, unknown)
+                continue
+            length = _length(data, at, end)
+            if length <= 0:
+                break
+            at += self.parse(data[at : at + length], wall_ns, frames, unknown)  # of an unknown message that waited
         return at
 
     def _take(self, raw: bytes, following: int, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> bool:

@@ -24,6 +24,7 @@ from companion.link.framing import (
     build_frame,
     refusals,
 )
+from companion.link.line import LineReader
 from companion.link.signing import SETUP_SIGNING
 from companion.link.signing_times import KeptSigner, open_signer
 from companion.link.transport import Address, Transport, open_transport
@@ -78,7 +79,7 @@ class Wire:
         self._formats = message_formats()
         self._parser = FrameParser(self._formats, self.counters, guard)
         self._seq = 0
-        self._leftover = b""
+        self._line = LineReader(self._parser) if transport.stream else None
         self._gathered: list[bytes] | None = None
         self._owned: KeptSigner | None = None
         self._kept: list[Frame] = []
@@ -139,9 +140,9 @@ class Wire:
     def receive(self, timeout_s: float, spin_s: float = 0.0) -> list[Frame]:
         """Wait for the link at most this long, then return every good frame that is there, in the order of arrival.
 
-        An empty list may come early (garbage, foreign senders): the caller watches the clock itself. One call reads a
-        bounded number of datagrams, so that a flood cannot keep it; what is left is there for the next call. A
-        timeout is rounded up to milliseconds.
+        An empty list may come early (garbage, foreign senders, a line that fell silent): the caller watches the clock
+        itself. One call reads a bounded number of datagrams, so that a flood cannot keep it; what is left is there for
+        the next call. A timeout is rounded up to milliseconds.
 
         Args:
             timeout_s: how long to wait for the first datagram.
@@ -160,8 +161,12 @@ class Wire:
         frames: list[Frame] = []
         unknown: list[bytes] = []
         if not self._spin(spin_s, frames, unknown):
+            if self._line is not None:
+                timeout_s = min(timeout_s, self._line.wait_s(time.monotonic_ns()))
             if not self._poll.poll(max(0.0, timeout_s) * 1e3):
-                return frames
+                if self._line is None:
+                    return frames
+                self._rest(self._line, frames, unknown)
             for _ in range(_READS_MAX):
                 if not self._read(frames, unknown):
                     break
@@ -183,8 +188,8 @@ class Wire:
         if got is None:
             return False
         wall_ns = time.monotonic_ns()
-        if self._transport.stream:
-            self._parse_stream(got[0], wall_ns, frames, unknown)
+        if self._line is not None:
+            self._parse_stream(self._line, got[0], wall_ns, frames, unknown)
         else:
             self._parse_datagram(got[0], got[1], wall_ns, frames, unknown)
         return True
@@ -249,16 +254,22 @@ class Wire:
         self.send(HEARTBEAT, encode_heartbeat())
         self.peer = before
 
-    def _parse_stream(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> None:
+    def _parse_stream(
+        self, line: LineReader, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes]
+    ) -> None:
         """Use what a line brought, keeping an unfinished frame for the next time."""
-        data = self._leftover + data
         before = len(frames)
-        done = self._parser.parse(data, wall_ns, frames, unknown, final=False)
-        self._leftover = data[done:]  # less than one frame
+        line.take(data, wall_ns, frames, unknown)
         if len(frames) > before:
             self._heard_ns = wall_ns
         elif self._guard is not None:
             self._greet(None, wall_ns)
+
+    def _rest(self, line: LineReader, frames: list[Frame], unknown: list[bytes]) -> None:
+        """Use what waits behind an unfinished frame, if a line is silent now."""
+        line.rest(time.monotonic_ns(), frames, unknown)
+        if frames:
+            self._heard_ns = frames[-1].arrival_wall_ns
 
     def _note(self, frames: list[Frame], unknown: list[bytes]) -> None:
         """Keep what came for the tap."""

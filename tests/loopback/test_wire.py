@@ -14,6 +14,7 @@ from typing import ClassVar
 import pytest
 
 from companion.errors import InputError, LinkError
+from companion.ground.links import GroundPort
 from companion.link import codec
 from companion.link.framing import Frame, FrameParser, LinkCounters, build_frame
 from companion.link.transport import UdpTransport, parse_connection, port_holder
@@ -424,6 +425,36 @@ def test_a_line_carries_every_byte_both_ways():
         raw = os.read(master, 300)
         assert raw[10:43] == bytes(range(1, 34))
         assert raw == build_frame(76, bytes(range(1, 34)), 0, 1, 191, FORMATS[76].crc_extra)
+
+
+@pytest.mark.parametrize("noise", [b"\xfd\xff\x00", b"\xfe\xff"])
+def test_on_a_quiet_line_noise_holds_nothing_back(noise):
+    with line() as (master, wire):
+        os.write(master, noise + heartbeat(1) + heartbeat(2))
+        begun_s = time.monotonic()
+        frames = wire.receive(0.0) or wire.receive(1.5) or wire.receive(1.5)
+        assert [frame.seq for frame in frames] == [1, 2]
+        assert time.monotonic() - begun_s < 1.0
+        assert wire.counters.garbage_bytes == len(noise)
+        assert wire.receive(0.0) == []
+        os.write(master, heartbeat(3))
+        assert [frame.seq for frame in collect(wire, 1)] == [3]
+
+
+def test_a_ground_line_delivers_what_noise_holds_back():
+    master, slave = pty.openpty()
+    with contextlib.ExitStack() as stack:
+        stack.callback(os.close, master)
+        port = GroundPort(f"serial:{os.ttyname(slave)}:57600", lambda: 1)
+        stack.callback(port.close)
+        os.close(slave)
+        os.write(master, b"\xfd\xff\x00" + heartbeat(1, system=255) + heartbeat(2, system=255))
+        found = []
+        end_s = time.monotonic() + 2.0
+        while not found and time.monotonic() < end_s:
+            found = port.receive()
+            time.sleep(0.01)
+        assert [frame.seq for frame, _ in found] == [1, 2]
 
 
 def test_frames_may_come_in_pieces():
