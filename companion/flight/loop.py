@@ -97,6 +97,7 @@ class FlightLoop:
             changed, and with the delays of the whole flight at the end; must not block.
         delayed: called with the delays that were predicted over since the last time; must not block.
         only_gates: nothing is flown: it ends when the gates have judged.
+        met: called once with the vehicle's system id, before anything else of it is used; must not block.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class FlightLoop:
         delayed: Callable[[list[tuple[float, float]]], None] = lambda delays: None,
         only_gates: bool = False,
         paced: Callable[[bool], None] = lambda waits: None,
+        met: Callable[[int], None] = lambda system: None,
     ) -> None:
         self._flight = flight
         self._trajectory = trajectory
@@ -131,6 +133,7 @@ class FlightLoop:
         self._delayed = delayed
         self._only_gates = only_gates
         self._paced = paced
+        self._tell_met = met
         self._autopilot = Autopilot()
         self._compiled = compiled
         self._adaptation: Adaptation | None = None
@@ -288,6 +291,7 @@ class FlightLoop:
         system = self._system
         if system is None:
             system = find_autopilot(self._wire, self._connection, self._connect_timeout_s, lambda: self._interrupted)
+        self._tell_met(system)
         self._heard_ns = self._spoken_ns = time.monotonic_ns()
         self._telemetry = Telemetry(system)
         self._ops = Operations(self._wire.send, system)

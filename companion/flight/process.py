@@ -154,6 +154,7 @@ class Ready:
             system=system,
             host=host,
             paced=pace,
+            met=self.recorder.follow,
             engaged=lambda engagement: self.recorder.state("engagement", json.dumps(asdict(engagement))),
             delayed=lambda delays: self.recorder.state("delays", json.dumps(delays)),
         )

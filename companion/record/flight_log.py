@@ -1,7 +1,7 @@
 """Turns what the control process hands over into the bytes of `flight.ulg`: rows, traffic and texts, as they come.
 
-The file begins when the vehicle's time is known, because all its times are the vehicle's; texts that come before that
-wait for it.
+The file begins when the vehicle's time is known, because all its times are the vehicle's; texts and the autopilot's
+parameters that come before that wait for it.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ class Entry(IntEnum):
     """A severity in one byte, and UTF-8."""
     FACT = 18
     """A key, a zero byte, and what is known under it, as UTF-8: the last one of a key counts, of "delays" all."""
+    SYSTEM = 19
+    """The system id of the autopilot that is flown, in one byte."""
 
 
 class FlightLog:
@@ -62,6 +64,7 @@ class FlightLog:
         self._traffic = Traffic(self._write, self._say, self._set, epoch_minus_wall_ns)
         self._out: list[bytes] = []
         self._held: list[tuple[int, str]] = []
+        self._held_parameters: dict[str, Number] = {}
         self._begun = False
         self._synced_us = 0
         self._envelope: float | None = None
@@ -84,6 +87,8 @@ class FlightLog:
         elif kind == Entry.FACT:
             key, _, fact = content.decode("utf-8", "replace").partition("\0")
             self._out.append(ulog.long_info(key, fact))
+        elif kind == Entry.SYSTEM:
+            self._traffic.follow(content[0])
         elif kind in {Direction.IN, Direction.OUT}:
             self._traffic.take(kind, content, wall_ns)
         self._begin_when_time_is_known(wall_ns)
@@ -127,11 +132,14 @@ class FlightLog:
         parts = [ulog.header(start_us)]
         parts += [ulog.format_definition(topic) for topic in topics.TOPICS]
         parts += self._facts((wall_ns + self._epoch_minus_wall_ns) // 1000 if wall_ns else None)
-        numbers = {"MAV_TYPE": self._traffic.vehicle_type, **dict(_numbers(self._settings))}
+        read = self._held_parameters
+        numbers = {"MAV_TYPE": read.pop("MAV_TYPE", None), **dict(_numbers(self._settings))}
         parts += [ulog.parameter(key, value) for key, value in numbers.items() if value is not None]
         parts += [ulog.subscription(topic, number) for number, topic in enumerate(topics.TOPICS)]
         parts += [ulog.logged(level, start_us, text) for level, text in self._held]
         self._held.clear()
+        parts += [ulog.parameter(name, value) for name, value in read.items()]
+        read.clear()
         self._out[:0] = parts
 
     def _facts(self, epoch_us: int | None) -> Iterator[bytes]:
@@ -167,6 +175,8 @@ class FlightLog:
         """A parameter of the autopilot: behind the definitions a change, as its value was not known there."""
         if self._begun:
             self._out.append(ulog.parameter(name, value))
+        else:
+            self._held_parameters[name] = value
 
     def _take_row(self, content: bytes) -> None:
         row = _ROW.unpack(content)

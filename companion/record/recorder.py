@@ -146,6 +146,14 @@ class Recorder:
         """
         self.offer(Entry.FACT, f"{key}\0{fact}".encode("utf-8", "replace"), 0)
 
+    def follow(self, system: int) -> None:
+        """Tell whose the flight is: the autopilot's system id. Never blocks.
+
+        Without this the log follows the first autopilot that sends a heartbeat; one that was known before the recorder
+        was started may send others first.
+        """
+        self.offer(Entry.SYSTEM, bytes((system,)), 0)
+
     def give_way(self) -> None:
         """The vehicle is in lockstep: the logs are written when the ring is half full and at the end, so that the child
         leaves the processors to the two processes that wait for each other."""

@@ -61,7 +61,8 @@ class Traffic:
     Args:
         write: gets the records.
         say: gets what belongs into the log as a text.
-        parameter: gets each of the autopilot's parameters that is read, when it is new or another than before.
+        parameter: gets each of the autopilot's parameters that is read, and MAV_TYPE, when it is new or another than
+            before.
         epoch_minus_wall_ns: turns monotonic into epoch nanoseconds.
     """
 
@@ -70,8 +71,6 @@ class Traffic:
     ) -> None:
         self.now_us: int | None = None
         """Vehicle time as far as it was heard [us]; never steps back."""
-        self.vehicle_type: int | None = None
-        """MAV_TYPE, once heard."""
         self.dropped = 0
         """Entries that are missing in the log, as far as somebody told us."""
         self._write, self._say, self._parameter = write, say, parameter
@@ -83,6 +82,7 @@ class Traffic:
         self._resets: int | None = None
         self._texts = StatusTexts()
         self._parameters: dict[str, Number] = {}
+        self._kind: int | None = None
         self._mode: Mode | None = None
         self._intended: Mode | None = None
         self._armed = False
@@ -146,9 +146,15 @@ class Traffic:
             return False
         if codec.decode_heartbeat(frame.payload).autopilot == codec.MAV_AUTOPILOT_INVALID:
             return False
-        self._system = frame.sysid
-        self._telemetry = Telemetry(frame.sysid)
+        self.follow(frame.sysid)
         return True
+
+    def follow(self, system: int) -> None:
+        """The autopilot is the one with this system id, from now on; without this, the first one with a heartbeat."""
+        if self._telemetry is None or system != self._system:
+            self._system = system
+            self._telemetry = Telemetry(system)
+            self._seq = self._state_us = None
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -237,7 +243,9 @@ class Traffic:
 
     def _on_heartbeat(self, frame: Frame) -> None:
         heartbeat = codec.decode_heartbeat(frame.payload)
-        self.vehicle_type = heartbeat.type
+        if heartbeat.type != self._kind:
+            self._kind = heartbeat.type
+            self._parameter("MAV_TYPE", heartbeat.type)
         self._armed = heartbeat.armed
         self._fly(Mode.from_custom_mode(heartbeat.custom_mode))
         self._tell_status()
@@ -258,12 +266,12 @@ class Traffic:
             self._say(Level.INFO, f"the autopilot reports {mode.label}")
 
     def _tell_status(self) -> None:
-        if self.now_us is None or self.vehicle_type is None or self._mode is None:
+        kind = self._kind
+        if self.now_us is None or kind is None or self._mode is None:
             return
         flown = NAV_STATES.get(self._mode, UNKNOWN_MODE)
         intended = UNKNOWN_MODE if self._intended is None else NAV_STATES.get(self._intended, UNKNOWN_MODE)
-        rotary = int(self.vehicle_type in ROTARY_WINGS)
-        kind = self.vehicle_type
+        rotary = int(kind in ROTARY_WINGS)
         self._write(
             topics.STATUS,
             self.now_us,

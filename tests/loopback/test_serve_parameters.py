@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from flight_cases import Stand
 from pymavlink.dialects.v20 import development as mavlink
+from pyulog import ULog
 from serve_cases import PlainTool, Serving, serving, until
 
 from companion.campaign.replay import replay
@@ -68,6 +69,8 @@ def test_a_change_in_flight_ramps_is_recorded_and_outlives_the_program(
     assert begin_s > summary["engagement"]["at_s"]
     folder = next((tmp_path / "flights").iterdir())
     assert replay(folder, kernels("python")).identical
+    log = ULog(str(folder / "flight.ulg"))
+    assert "COM_OF_LOSS_T" in {name for _, name, _ in log.changed_parameters}  # though read before any heartbeat
     assert (tmp_path / "trajectories" / ".parameters-paper.toml").read_text().endswith("[controller]\nk1_1_s = 0.8\n")
     serve.kill(serve.ground_pid)
     until(lambda: "the ground process is back" in serve.log)

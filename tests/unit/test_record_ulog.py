@@ -167,8 +167,8 @@ def test_every_column_of_the_record_is_in_the_log_in_full() -> None:
 class Vehicle:
     """Makes the frames of an autopilot and of us."""
 
-    def __init__(self) -> None:
-        self._theirs = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    def __init__(self, system: int = 1) -> None:
+        self._theirs = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
         self._ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
 
     def says(self, message) -> tuple[int, bytes]:
@@ -425,6 +425,39 @@ def test_texts_wait_for_the_vehicles_time_and_a_flight_without_one_has_them_too(
     with_time = parse(written([*said, vehicle.heartbeat(), vehicle.state(START_US)]))
     assert with_time.start_us == START_US
     assert with_time.texts[0] == (3, START_US, "nobody there: größer")
+
+
+def parameter(vehicle: Vehicle, name: bytes, value: float) -> tuple[int, bytes]:
+    return vehicle.says(mavlink.MAVLink_param_value_message(name, value, 9, 1, 0))
+
+
+def test_parameters_wait_for_the_vehicles_time_too() -> None:
+    vehicle = Vehicle()
+    read = [parameter(vehicle, name, value) for name, value in ((b"A", 1.5), (b"B", 2.0), (b"A", 2.5))]
+    log = parse(written([vehicle.heartbeat(), *read, vehicle.state(START_US), parameter(vehicle, b"C", 3.0)]))
+    assert log.changed == [("A", 2.5), ("B", 2.0), ("C", 3.0)]
+    assert log.parameters == {"MAV_TYPE": 2}
+    assert parse(written([vehicle.heartbeat(), *read])).changed == [("A", 2.5), ("B", 2.0)]
+
+
+def test_a_vehicle_that_is_known_already_is_followed_before_its_heartbeat() -> None:
+    """As in `companion serve`: parameters are read at once, and the next heartbeat may be a second away."""
+    vehicle = Vehicle()
+    system = (Entry.SYSTEM, bytes((1,)))
+    read = parameter(vehicle, b"COM_OF_LOSS_T", 1.0)
+    states = [vehicle.state(START_US + 4000 * index) for index in range(3)]
+    log = parse(written([system, *states[:2], read, vehicle.heartbeat(), states[2]]))
+    assert log.start_us == START_US
+    assert len(log.data["vehicle_local_position"]) == 3
+    assert log.changed == [("COM_OF_LOSS_T", 1.0), ("MAV_TYPE", 2)]
+    assert log.data["vehicle_status"][0][6:] == (2, 1, 1)
+
+
+def test_the_vehicle_that_is_flown_is_followed_and_not_the_first_one_heard() -> None:
+    vehicle, other = Vehicle(), Vehicle(system=7)
+    entries = [other.heartbeat(), other.state(START_US + 10**9), (Entry.SYSTEM, bytes((1,))), vehicle.heartbeat()]
+    log = parse(written([*entries, other.state(START_US + 10**9 + 4000), *(vehicle.state(START_US + 10**10),) * 2]))
+    assert [record[0] for record in log.data["vehicle_local_position"]] == [START_US + 10**9, START_US + 10**10]
 
 
 def test_a_hole_is_marked_where_rows_are_missing() -> None:
