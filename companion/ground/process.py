@@ -62,19 +62,19 @@ class Ground:
         settings: of `companion serve`.
         channel: to the control process; implements `commands.Requests` through `request`.
         report: to the supervisor.
+        guards: the keys; they stay the caller's, who closes them however this ends.
 
     Raises:
         InputError, LinkError: a ground link or the folder cannot be used; after a restart a ground link is waited for.
     """
 
-    def __init__(self, settings: Settings, channel: Channel, report: Report) -> None:
+    def __init__(self, settings: Settings, channel: Channel, report: Report, guards: Guards) -> None:
         self._channel = channel
         self._report = report
         self._standing = Standing()
         self._systems = frozenset(settings.ground_systems)
-        self._guards = Guards()
         self._links = [
-            GroundPort(connection, self._system, self._guards.of(key), self._systems)
+            GroundPort(connection, self._system, guards.of(key), self._systems)
             for connection, key in settings.ground_links
         ]
         self._vehicle = VehicleLink(channel)
@@ -97,7 +97,7 @@ class Ground:
         self._faults: set[str] = set()
         # What the control process has verified is verified again: what was used on another link is no news here.
         self._copied = LinkCounters()
-        self._copies = FrameParser(message_formats(), self._copied, self._guards.of(settings.key))
+        self._copies = FrameParser(message_formats(), self._copied, guards.of(settings.key))
         self._watch = RefusalWatch(self._report.line)
         self._stopping = False
 
@@ -129,7 +129,6 @@ class Ground:
         self._files.close()
         self._parameters.close()
         self._ports.close()
-        self._guards.close()
         return int(ExitCode.DONE)
 
     def _tick(self, now_s: float) -> None:
@@ -216,8 +215,9 @@ def main() -> int:
     channel = Channel(socket.socket(fileno=int(channel_fd)))
     channel.discard()
     os.nice(_NICE)
+    guards = Guards()
     try:
-        ground = Ground(Settings.from_json(settings), channel, report)
+        ground = Ground(Settings.from_json(settings), channel, report, guards)
         for number in (signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: ground.stop())
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor says when
@@ -229,6 +229,8 @@ def main() -> int:
         traceback.print_exc()
         report.send(error=f"a fault of the program: {type(error).__name__}: {error}")
         return int(ExitCode.INTERNAL)
+    finally:
+        guards.close()
 
 
 if __name__ == "__main__":

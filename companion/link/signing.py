@@ -19,6 +19,7 @@ from typing import Final
 KEY_BYTES: Final = 32
 UNITS_PER_S: Final = 100_000
 """Of signing time."""
+NS_PER_UNIT: Final = 10_000
 EPOCH_S: Final = 1_420_070_400
 """2015-01-01 00:00 UTC, the zero of signing time, in Unix time."""
 NEW_STREAM_LATE: Final = 60 * UNITS_PER_S
@@ -39,7 +40,6 @@ SETUP_SIGNING: Final = 256
 """The message that carries a key: it is never logged and never passed on."""
 
 _TIME_BYTES: Final = 6
-_NS_PER_UNIT: Final = 10_000
 
 
 class SigningKey:
@@ -97,11 +97,13 @@ class SigningTimes:
     """All that signing has to remember; `signing_times` keeps it across restarts."""
 
     newest: int
-    """The latest time that was sent or accepted."""
+    """The latest time that was sent or accepted, or that may have been before these were loaded."""
     streams: dict[int, int]
     """Latest time of each stream, by `stream_of`."""
     floor: int = -1
     """Nothing up to this time is accepted of any stream: of what came just before a crash nothing is known."""
+    used: int = 0
+    """The latest time that is known to have been sent or accepted before these were loaded."""
     link_id: int = 0
     """Of what we send."""
     reserved: int = TIME_END
@@ -110,7 +112,7 @@ class SigningTimes:
 
 def time_now() -> int:
     """Signing time by this machine's clock."""
-    return max(0, time.time_ns() // _NS_PER_UNIT - EPOCH_S * UNITS_PER_S)
+    return max(0, time.time_ns() // NS_PER_UNIT - EPOCH_S * UNITS_PER_S)
 
 
 def stream_of(system: int, component: int, link_id: int) -> int:
@@ -132,7 +134,7 @@ class Signer:
         self._hash = sha256(key.secret)
         self._link = bytes((times.link_id,))
         # From here on time passes by the monotonic clock: a step of the machine's clock must not reach a flight.
-        self._zero = time_now() - time.monotonic_ns() // _NS_PER_UNIT
+        self._zero = time_now() - time.monotonic_ns() // NS_PER_UNIT
 
     @property
     def outdated(self) -> int:
@@ -152,7 +154,7 @@ class Signer:
 
     def now(self) -> int:
         """Signing time: the clock, or what others have told, whichever is later."""
-        return max(self.times.newest, self._zero + time.monotonic_ns() // _NS_PER_UNIT)
+        return max(self.times.newest, self._zero + time.monotonic_ns() // NS_PER_UNIT)
 
     def sign(self, unsigned: bytes) -> bytes:
         """The 13 bytes that end a frame which has the signed flag set.
@@ -161,7 +163,7 @@ class Signer:
         """
         times = self.times
         newest = times.newest + 1
-        clock = self._zero + time.monotonic_ns() // _NS_PER_UNIT
+        clock = self._zero + time.monotonic_ns() // NS_PER_UNIT
         newest = newest if newest > clock else clock
         times.newest = newest = newest if newest < TIME_END else TIME_END - 1
         tail = self._link + newest.to_bytes(_TIME_BYTES, "little")
@@ -200,9 +202,15 @@ class Signer:
             counters.stale += 1
             return False
         times.streams[stream] = at
-        times.newest = max(times.newest, at)
+        if at > times.newest:
+            times.newest = at
+            if at > times.reserved:
+                self._passed()
         counters.accepted += 1
         return True
+
+    def _passed(self) -> None:
+        """A time beyond those that are reserved was accepted."""
 
     def _begins(self, at: int) -> bool:
         """Whether a stream may begin at this time."""

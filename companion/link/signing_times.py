@@ -3,7 +3,9 @@
 Every process that uses a key has a place of its own in the folder of that key, locked while it lives, with a link id of
 its own. A place begins after everything that any place of the key has on the disk. On the disk is more than was used:
 times up to `RESERVE_S` ahead count as used when the process did not end in order, of everybody's messages too, because
-what came in its last seconds is not there. Everybody who hears us takes our time over, so nobody is locked out by that.
+what came in its last seconds is not there. Everybody who hears us takes our time over, so nobody is locked out by that
+but for who does not hear us, for so long. What only may have been used is not reserved on top of again: processes that
+end soon and out of order, one after the other, would lock those out for longer every time.
 
 The disk is written every few seconds by a thread that sleeps otherwise: a write can take longer than control steps.
 """
@@ -15,19 +17,22 @@ import fcntl
 import json
 import os
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
 from companion.errors import InputError
 from companion.link.key_file import load_key
-from companion.link.signing import TIME_END, UNITS_PER_S, Signer, SigningKey, SigningTimes, time_now
+from companion.link.signing import NS_PER_UNIT, TIME_END, UNITS_PER_S, Signer, SigningKey, SigningTimes, time_now
 
 KEEP_EVERY_S: Final = 5.0
 RESERVE_S: Final = 15.0
 PLACES_MAX: Final = 64
 """Processes that may use one key at the same time on one machine."""
 _RESERVE: Final = int(RESERVE_S * UNITS_PER_S)
+_SIGNED: Final = UNITS_PER_S
+"""Signing takes less than this until the next writing, while time is ahead of the clock: one unit for a frame."""
 _LOOK_S: Final = 1.0
 
 
@@ -47,7 +52,9 @@ class KeptSigner(Signer):
     def __init__(self, key: SigningKey, place: Place) -> None:
         self._place = place
         super().__init__(key, place.load())
-        self._done = threading.Event()
+        self._begun = self.times.newest
+        self._done = False
+        self._wake = threading.Event()
         self.problem = ""
         """Why the times cannot be kept at present."""
         self.keep()
@@ -59,30 +66,47 @@ class KeptSigner(Signer):
 
     def keep(self) -> None:
         """Writes the times, and those ahead that count as used, to the disk."""
-        newest = self.now()
+        now = self.now()
+        used = max(self._used(), self._zero + time.monotonic_ns() // NS_PER_UNIT)
+        reserved = max(used + _RESERVE, now + _SIGNED)
         try:
-            self._place.store(self.times, newest, newest + _RESERVE, ended=False)
-            self.times.reserved = newest + _RESERVE
+            self._place.store(self.times, used, reserved, ended=False)
+            self.times.reserved = reserved
             self.problem = ""
         except OSError as error:
             self.problem = f"{self._place.path}: cannot be written ({error.strerror})"
 
+    def _used(self) -> int:
+        """The latest time that was really sent or accepted, as far as is known."""
+        times = self.times
+        last = times.newest if times.newest > self._begun else times.used
+        return max(last, *times.streams.copy().values(), 0)
+
+    def _passed(self) -> None:
+        self._wake.set()
+
     def _run(self) -> None:
-        kept = self.now()
-        while not self._done.wait(_LOOK_S):
-            now = self.now()
-            if now - kept >= KEEP_EVERY_S * UNITS_PER_S or now > self.times.reserved - _RESERVE // 3:
-                kept = now
+        kept_s = time.monotonic()
+        while True:
+            self._wake.wait(_LOOK_S)
+            self._wake.clear()
+            if self._done:
+                return
+            now_s = time.monotonic()
+            if now_s - kept_s >= KEEP_EVERY_S or self.now() > self.times.reserved - _SIGNED // 2:
+                kept_s = now_s
                 self.keep()
 
     def close(self) -> None:
         """Ends in order: nothing more is signed or verified, and nothing ahead counts as used."""
-        if self._done.is_set():
+        if self._done:
             return
-        self._done.set()
+        self._done = True
+        self._wake.set()
         self._thread.join()
+        used = self._used()
         with contextlib.suppress(OSError):  # then the reserve counts as used
-            self._place.store(self.times, self.times.newest, self.times.newest, ended=True)
+            self._place.store(self.times, used, used, ended=True)
         self._place.release()
 
     def __enter__(self) -> KeptSigner:
@@ -130,9 +154,11 @@ class Place:
         taken = set()
         for path, kept in self._all():
             alive = path != self.path and self._is_alive(path)  # which knows its own times, and ends on its own
-            times.newest = max(times.newest, kept["newest"] if alive else kept["reserved"])
+            times.used = max(times.used, kept["newest"])
+            times.floor = max(times.floor, kept.get("floor", -1))  # of one who began after a crash, and goes on
             if not kept["ended"] and not alive:
                 times.floor = max(times.floor, kept["reserved"])
+            times.newest = max(times.newest, kept["newest"] if alive else kept["reserved"], times.floor)
             for stream, last in kept["streams"].items():
                 times.streams[int(stream)] = max(times.streams.get(int(stream), 0), last)
             if path == self.path:
@@ -161,6 +187,8 @@ class Place:
                 numbers = (kept["newest"], kept["reserved"], *kept["streams"].values(), *map(int, kept["streams"]))
                 if not all(isinstance(number, int) and 0 <= number <= TIME_END for number in numbers):
                     raise ValueError
+                if not isinstance(floor := kept.get("floor", -1), int) or not -1 <= floor <= TIME_END:
+                    raise ValueError
                 if kept["link_id"] not in range(256) or not isinstance(kept["ended"], bool):
                     raise ValueError
             except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -179,6 +207,7 @@ class Place:
         newest, reserved = min(newest, TIME_END), min(reserved, TIME_END)  # what is later would count as damaged
         kept = {
             **{"newest": newest, "reserved": reserved, "ended": ended, "link_id": times.link_id},
+            "floor": times.floor,
             "streams": {str(stream): last for stream, last in times.streams.copy().items()},
         }
         beside = self.path.with_suffix(".new")

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -98,6 +99,68 @@ def test_after_a_kill_nothing_is_used_twice(tmp_path):
         assert accepts(signer, heartbeat(vehicle(signer.now())))  # whoever hears us takes our time over
 
 
+def crashed(signer):
+    """Ends a signer as a crash does, for the times on the disk."""
+    signer._done = True
+    signer._wake.set()
+    signer._thread.join()
+    signer._place.release()
+
+
+def test_crashes_one_after_the_other_do_not_lock_out_for_longer_and_longer(tmp_path):
+    """Of a process that is not heard by whoever speaks to it: a tool behind the autopilot's radio."""
+    for _ in range(8):
+        signer = opened(tmp_path)
+        assert signer.times.floor <= signer.now()
+        crashed(signer)
+    with opened(tmp_path) as signer:
+        assert signer.times.floor <= time_now() + RESERVE + 8 * UNITS_PER_S
+        assert sent_at(signer) > signer.times.floor
+
+
+@pytest.mark.parametrize("in_order", [False, True])
+@pytest.mark.parametrize("ahead", [0, RESERVE - UNITS_PER_S, RESERVE + 10, 10 * RESERVE])
+def test_nothing_that_was_used_before_a_crash_is_accepted_by_anybody_after_it(tmp_path, ahead, in_order):
+    """Neither by the next process nor by those behind it, however that one ended."""
+    signer = opened(tmp_path)
+    raw = heartbeat(vehicle(time_now() + ahead))
+    assert accepts(signer, raw)
+    last = latest = sent_at(signer)
+    until_s = time.monotonic() + 10.0  # the thread is told of what is beyond the reserve, and writes
+    while json.loads((tmp_path / "0.json").read_text())["reserved"] < last and time.monotonic() < until_s:
+        time.sleep(0.001)
+    crashed(signer)
+    for _ in range(3):
+        signer = opened(tmp_path)
+        assert not accepts(signer, raw)
+        assert signer.times.floor >= last
+        again = sent_at(signer)
+        assert again > latest
+        latest = again
+        if in_order:
+            signer.close()
+        else:
+            crashed(signer)
+            last = again
+
+
+def test_what_is_signed_ahead_of_the_clock_is_covered(tmp_path):
+    crashed(opened(tmp_path))
+    signer = opened(tmp_path)
+    last = [sent_at(signer) for _ in range(10_000)][-1]
+    assert last > time_now() + RESERVE // 2
+    crashed(signer)
+    with opened(tmp_path) as signer:
+        assert signer.times.floor >= last
+
+
+def test_times_of_an_older_version_are_read(tmp_path):
+    old = {"newest": 5, "reserved": time_now() + 50 * UNITS_PER_S, "ended": False, "link_id": 9, "streams": {}}
+    (tmp_path / "0.json").write_text(json.dumps(old))
+    with opened(tmp_path) as signer:
+        assert (signer.times.floor, signer.times.link_id) == (old["reserved"], 9)
+
+
 def test_everything_used_is_covered_by_what_is_on_the_disk(tmp_path):
     with opened(tmp_path) as signer:
         kept = json.loads((tmp_path / "0.json").read_text())
@@ -159,6 +222,7 @@ def test_places_are_apart_and_know_what_the_others_accepted(tmp_path):
         *("", "[]", "{}", "null", '{"newest": 1}'),
         '{"newest": -1, "reserved": 0, "ended": true, "link_id": 0, "streams": {}}',
         '{"newest": 1.5, "reserved": 0, "ended": true, "link_id": 0, "streams": {}}',
+        '{"newest": 1, "reserved": 0, "floor": "0", "ended": true, "link_id": 0, "streams": {}}',
         '{"newest": 1, "reserved": 0, "ended": 1, "link_id": 0, "streams": {}}',
         '{"newest": 1, "reserved": 0, "ended": true, "link_id": 256, "streams": {}}',
         '{"newest": 1, "reserved": 0, "ended": true, "link_id": 0, "streams": {"x": 1}}',
