@@ -156,11 +156,14 @@ class Course:
         return self._clearance is None or self._clearance.breach(way, joins=joins) is None
 
     def obstruction(self) -> str:
-        """What is in the way of it, ground or a fence, for people; "": nothing, as far as that is known."""
+        """What is in the way of it, ground or a fence, for people; "": nothing, as far as that is known.
+
+        The trajectory itself comes first: its join and stop are no better than it is.
+        """
         if self._clearance is None:
             return ""
-        for _, piece in self.pieces:
-            joins = piece is not self.path and self.join_s > 0.0 and piece is self._chain.pieces[0]
+        for piece in sorted((piece for _, piece in self.pieces), key=lambda piece: piece is not self.path):
+            joins = self.join_s > 0.0 and piece is self._chain.pieces[0]
             breach = self._clearance.breach(piece, joins=joins)
             if breach is not None:
                 name, advice = _ADVICE["join" if joins else "track" if piece is self.path else "stop"]

@@ -46,7 +46,7 @@ def fly(tmp_path: Path, prepare=lambda stand: None, start: Any = AT, **options: 
 def test_it_is_refused_near_the_ground(tmp_path) -> None:
     stand, flown = fly(tmp_path, start=((0.0, 0.0, -4.0), 0.0))
     assert flown.cause is Cause.REFUSED
-    assert "height above home falls to 4.0" in flown.outcome.sentence
+    assert "falls to 4.00 m above home" in flown.outcome.sentence
     assert stand.setpoints() == [] and stand.mode is Mode.HOLD
 
 

@@ -105,7 +105,7 @@ def test_setup_that_is_wrong_in_many_ways(tmp_path) -> None:
             Gate.TERMINATION: ("refused", "PX4 stops the motors from 60 deg of tilt, limits.tilt_max_rad is 72 deg"),
             Gate.THRUST_CURVE: ("refused", "the thrust curve is undone twice; set rotors.curve_factor to 0"),
             Gate.THRUST_SCALING: ("warning", "PX4 scales the thrust with the battery's voltage"),
-            Gate.HOVER_THRUST: ("warning", "PX4 hovers with a thrust of 0.80, by the vehicle file it is 0.49"),
+            Gate.HOVER_THRUST: ("warning", "PX4 hovers with a thrust of 0.80, by the vehicle file it is 0.56"),
             Gate.FENCE: ("warning", "leaving the autopilot's fence stops the motors in the air"),
             Gate.ARMING: ("refused", "no connection to the ground control station"),
         },

@@ -446,6 +446,7 @@ def test_a_ground_line_delivers_what_noise_holds_back():
     with contextlib.ExitStack() as stack:
         stack.callback(os.close, master)
         port = GroundPort(f"serial:{os.ttyname(slave)}:57600", lambda: 1)
+        port.open()
         stack.callback(port.close)
         os.close(slave)
         os.write(master, b"\xfd\xff\x00" + heartbeat(1, system=255) + heartbeat(2, system=255))

@@ -11,18 +11,20 @@ from format_cases import DATA, EIGHT, mavsdk, place
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.cli.common import adjustments, trajectory_changes
-from companion.config import build_flight, load_flight, read_toml
+from companion.config import build_flight, load_flight, load_vehicle, read_toml
+from companion.control.types import Vec3
 from companion.errors import InputError, RefusedError
 from companion.flight import launch
+from companion.flight.course import Course
 from companion.flight.inspection import reference_problems
 from companion.flight.phases import Autopilot
 from companion.flight.preflight import gate_place, gate_reference
 from companion.flight.reports import take_report
-from companion.flight.surroundings import gate_ground
+from companion.flight.surroundings import gate_course
 from companion.frames import GeoPoint
 from companion.link.framing import Frame
 from companion.record.folder import CONFIGURATION_FILE, create_flight_folder, write_configuration
-from companion.trajectory.anchored import Trajectory, anchored
+from companion.trajectory.anchored import Trajectory
 from companion.trajectory.fence import Fence, Polygon
 from companion.trajectory.load import embedded, load, of_flight, stored
 from companion.trajectory.shapes import Hover, Lissajous
@@ -131,12 +133,20 @@ def test_the_ground_is_kept_away_from() -> None:
     with pytest.raises(RefusedError, match=r"height above home falls to 0\.40 m at .* at least 0\.5 m are required"):
         gate_place(hovering(0.4), 0.5)
     gate_place(hovering(-30.0), -40.0)
+
     # In the air, against the home that the vehicle has told.
-    path = anchored(hovering(3.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    gate_ground(path, None, 0.5)
-    gate_ground(path, (0.0, 0.0, 1.0), 0.5)
+    def looked_at(place: Vec3, home: Vec3 | None) -> None:
+        course = Course(hovering(3.0), load_vehicle("bundled"), (0.0, 0.0, -1.0), 0.0, place, 0.5)
+        gate_course(course, home, 0.5)
+
+    low = (0.0, 0.0, 1.0)
+    looked_at(low, low)
+    looked_at(low, None)
+    with pytest.raises(RefusedError, match=r"it falls to -0\.50 m above home"):
+        gate_course(Course(hovering(-0.5), load_vehicle("bundled"), (0.0, 0.0, -1.0), 0.0, low, 0.5), low, 0.5)
+    # places on the Earth count from elsewhere: the ground is that of home all the same
     with pytest.raises(RefusedError, match=r"height above home falls to -4\.00 m"):
-        gate_ground(path, (0.0, 0.0, -6.0), 0.5)
+        looked_at(low, (0.0, 0.0, -6.0))
 
 
 def test_the_fence_is_a_gate() -> None:
