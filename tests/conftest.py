@@ -1,5 +1,6 @@
 """Paths that the tests share, and what is left out where numba is not there or hidden."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import pytest
 
 from companion import accelerate
 
+# mavutil decides at its import, once for all tests of a process, which version it begins with
+os.environ.setdefault("MAVLINK20", "1")
 sys.path.insert(0, str(Path(__file__).parent / "unit"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 

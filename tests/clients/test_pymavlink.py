@@ -1,12 +1,10 @@
 """pymavlink's own helpers for parameters and missions, and its connection, against the vehicle's ground link."""
 
-import os
 import time
 
 import pytest
 from client_tools import mission, vehicle
 
-os.environ.setdefault("MAVLINK20", "1")
 mavparm = pytest.importorskip("pymavlink.mavparm", reason="pymavlink is not installed")
 mavutil = pytest.importorskip("pymavlink.mavutil")
 mavwp = pytest.importorskip("pymavlink.mavwp")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -100,7 +99,6 @@ class Ftp:
     """pymavlink's client."""
 
     def __init__(self, port):
-        os.environ["MAVLINK20"] = "1"
         from pymavlink import mavftp, mavutil
 
         self.link = mavutil.mavlink_connection(f"udpout:127.0.0.1:{port}", source_system=255, source_component=190)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-os.environ.setdefault("MAVLINK20", "1")
 from pymavlink import mavutil
 
 from companion.cli import main
