@@ -83,7 +83,7 @@ class Clearance:
             at = int(np.argmin(margins))
             if margins[at] < -ON_THE_LINE_M and (worst is None or -margins[at] > worst.by_m):
                 by_m = -float(margins[at])
-                worst = Breach(by_m, float(times_s[at]), told.format(by=by_m, value=float(margins[at])))
+                worst = Breach(by_m, float(times_s[at]), told.format(by=by_m))
         return worst
 
     def _ground(self, points: Array, *, joins: bool) -> tuple[Array, str] | None:

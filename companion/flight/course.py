@@ -6,6 +6,8 @@ import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from enum import Enum
+from typing import NamedTuple
 
 from companion.config import Vehicle
 from companion.control.types import Reference, Vec3
@@ -65,11 +67,20 @@ def _clear(plan: Plan, limits: ReferenceLimits, easy: ReferenceLimits, clear: Ca
     return gentle_one
 
 
-_ADVICE = {
-    "join": ("its join", "; hold higher up or elsewhere, or let it begin at rest"),
-    "track": ("it", ""),
-    "stop": ("the stop after it", "; let it end at rest, or with more room"),
-}
+class Part(Enum):
+    """A part of a course: what to call it, and what to do where it is in the way of something, for people."""
+
+    JOIN = "its join", "; hold higher up or elsewhere, or let it begin at rest"
+    TRACK = "it", ""
+    STOP = "the stop after it", "; let it end at rest, or with more room"
+
+
+class Obstruction(NamedTuple):
+    """Ground or a fence in the way of a course."""
+
+    part: Part
+    sentence: str
+    """For people."""
 
 
 def at_rest(p: Vec3, yaw_rad: float) -> Reference:
@@ -155,20 +166,20 @@ class Course:
     def _is_clear(self, way: Piece, *, joins: bool = False) -> bool:
         return self._clearance is None or self._clearance.breach(way, joins=joins) is None
 
-    def obstruction(self) -> str:
-        """What is in the way of it, ground or a fence, for people; "": nothing, as far as that is known.
+    def obstruction(self) -> Obstruction | None:
+        """What is in the way of it, ground or a fence; None: nothing, as far as that is known.
 
         The trajectory itself comes first: its join and stop are no better than it is.
         """
         if self._clearance is None:
-            return ""
-        for piece in sorted((piece for _, piece in self.pieces), key=lambda piece: piece is not self.path):
-            joins = self.join_s > 0.0 and piece is self._chain.pieces[0]
-            breach = self._clearance.breach(piece, joins=joins)
+            return None
+        *joins, path, stopping = self._chain.pieces
+        for part, piece in ((Part.TRACK, path), *((Part.JOIN, way) for way in joins), (Part.STOP, stopping)):
+            breach = self._clearance.breach(piece, joins=part is Part.JOIN)
             if breach is not None:
-                name, advice = _ADVICE["join" if joins else "track" if piece is self.path else "stop"]
-                return f"{name} {breach.sentence}, {breach.at_s:.1f} s after it began{advice}"
-        return ""
+                name, advice = part.value
+                return Obstruction(part, f"{name} {breach.sentence}, {breach.at_s:.1f} s after it began{advice}")
+        return None
 
     def shift(self, by_m: Vec3) -> None:
         """Moves all of it (NED): after the autopilot's estimate has jumped by as much."""

@@ -14,7 +14,7 @@ import numpy as np
 from companion.config import Vehicle
 from companion.control.types import Reference, Vec3
 from companion.errors import RefusedError
-from companion.flight.course import Course
+from companion.flight.course import Course, Part
 from companion.flight.surroundings import HEIGHT_MIN_M, Margin, Problem, place_problems
 from companion.trajectory import torque
 from companion.trajectory.anchored import Anchored, Trajectory, anchored
@@ -214,8 +214,8 @@ def _ends(
     there = "the law's bounded position error" if by_law else f"a join of {course.join_s:.1f} s"
     problems = []
     obstruction = course.obstruction()
-    if obstruction and not obstruction.startswith("it "):  # the trajectory itself was looked at before
-        problems.append(Problem("join" if obstruction.startswith("its join") else "stop", None, obstruction))
+    if obstruction is not None and obstruction.part is not Part.TRACK:  # which was looked at before
+        problems.append(Problem(obstruction.part.name.lower(), None, obstruction.sentence))
     if not by_law:
         before = course.at(course.join_s - JUST_BEFORE_S)
         jump = max(dist(a, b) for a, b in zip(before[:4], first[:4], strict=True))

@@ -96,8 +96,8 @@ def gate_course(course: Course, home: Vec3 | None, height_min_m: float) -> None:
                 f" least {height_min_m:g} m are required (height_min_m of the flight file)"
             )
     obstruction = course.obstruction()
-    if obstruction:
-        raise RefusedError(f"trajectory {name!r}: {obstruction}")
+    if obstruction is not None:
+        raise RefusedError(f"trajectory {name!r}: {obstruction.sentence}")
 
 
 def separation(paths: Sequence[Anchored], step_s: float = 0.02) -> tuple[Margin, tuple[int, int]] | None:

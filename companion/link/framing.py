@@ -164,10 +164,7 @@ class FrameParser:
                 if self._take(raw, following, wall_ns, frames, unknown):
                     at += length
                     continue
-            found = _ANY_MAGIC.search(data, at + 1)
-            to = end if found is None else found.start()
-            self._counters.garbage_bytes += to - at
-            at = to
+            at = self._skip(data, at)
         return at
 
     def _parse_stream(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> int:
@@ -185,11 +182,15 @@ class FrameParser:
                 if self._take(data[at : at + length], following, wall_ns, frames, unknown):
                     at += length
                     continue
-            found = _ANY_MAGIC.search(data, at + 1)
-            to = end if found is None else found.start()
-            self._counters.garbage_bytes += to - at
-            at = to
+            at = self._skip(data, at)
         return at
+
+    def _skip(self, data: bytes, at: int) -> int:
+        """Where a frame may begin behind the byte at `at`, which begins none; what is between is garbage."""
+        found = _ANY_MAGIC.search(data, at + 1)
+        to = len(data) if found is None else found.start()
+        self._counters.garbage_bytes += to - at
+        return to
 
     def _following(self, data: bytes, at: int, to: int) -> int:
         """The byte behind a candidate, 0 when it is no frame as there is a good one in it or none behind it.

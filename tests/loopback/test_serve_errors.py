@@ -69,13 +69,8 @@ def test_a_port_in_use_ends_it_at_once(
     assert "is in use (process " in capfd.readouterr().err
 
 
-def test_a_folder_in_use_ends_it_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    folder = tmp_path / "trajectories"
-    folder.mkdir()
-    lock = FolderLock(folder)
+def refused_to_serve() -> None:
+    """`companion serve` in this process and folder, which must end as bad input; its signal handlers go with it."""
     free = [f"udpin:127.0.0.1:{free_udp_port()}" for _ in range(2)]
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
@@ -84,6 +79,18 @@ def test_a_folder_in_use_ends_it_at_once(
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
+
+
+def test_a_folder_in_use_ends_it_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "trajectories"
+    folder.mkdir()
+    lock = FolderLock(folder)
+    try:
+        refused_to_serve()
+    finally:
         lock.release()
     assert f"--folder {folder}: another `companion serve` uses it; give each its own" in capfd.readouterr().err
 
@@ -95,14 +102,7 @@ def test_a_parameters_file_that_cannot_be_used_ends_it_at_once(
     file = tmp_path / "trajectories" / ".parameters-paper.toml"
     file.parent.mkdir()
     file.write_text("controller = 3\n")
-    free = [f"udpin:127.0.0.1:{free_udp_port()}" for _ in range(2)]
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        arguments = ["--engine", "python", "--connect", free[0], "--ground", free[1]]
-        assert main(["serve", "--vehicle", "paper", *arguments]) == 2
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    refused_to_serve()
     error = capfd.readouterr().err
     assert str(file) in error
     assert error.count("\n") == 1

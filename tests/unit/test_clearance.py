@@ -51,7 +51,7 @@ HERE = helix("here", radius_m=3.0, climb_m_s=2.0)
 )
 def test_a_way_through_the_ground_is_refused(trajectory: Trajectory, hold: Any, part: str) -> None:
     unseen = Course(trajectory, VEHICLE, hold, 0.0, HOME)
-    assert unseen.obstruction() == ""
+    assert unseen.obstruction() is None
     assert lowest_m(unseen) < LEAST_M
     course = Course(trajectory, VEHICLE, hold, 0.0, HOME, LEAST_M)
     if lowest_m(course) >= LEAST_M:  # a brisker way was found
@@ -72,7 +72,7 @@ def test_a_brisker_way_is_taken_where_the_gentle_one_would_dip() -> None:
         course = Course(trajectory, VEHICLE, (5.0, 0.0, -5.0), 0.0, HOME, LEAST_M)
         if lowest_m(gentle) >= LEAST_M:
             assert course.join_s == gentle.join_s, "what is clear stays as it is"
-        elif not course.obstruction():
+        elif course.obstruction() is None:
             found += 1
             assert course.join_s < gentle.join_s
             assert lowest_m(course) >= LEAST_M - 1e-3
@@ -85,9 +85,9 @@ def test_a_hold_below_the_least_height_may_be_left() -> None:
         *("line", "test"),
         vehicle=VEHICLE,
     )
-    assert Course(up, VEHICLE, (0.0, 0.0, -0.3), 0.0, HOME, LEAST_M).obstruction() == ""
+    assert Course(up, VEHICLE, (0.0, 0.0, -0.3), 0.0, HOME, LEAST_M).obstruction() is None
     below = Course(HERE, VEHICLE, (0.0, 0.0, 0.2), 0.0, None, LEAST_M)
-    assert below.obstruction() == "", "where the ground is is not known"
+    assert below.obstruction() is None, "where the ground is is not known"
 
 
 def with_limits(**limits: float) -> Vehicle:
@@ -106,15 +106,18 @@ def test_the_fences_of_the_vehicle_file_hold_for_the_whole_way() -> None:
     hold = (4.0, 0.0, -6.0)
     assert (
         Course(circle, with_limits(fence_radius_m=20.0, fence_height_m=9.0), hold, 0.0, HOME, LEAST_M).obstruction()
-        == ""
+        is None
     )
     near = Course(circle, with_limits(fence_radius_m=4.04), hold, 0.0, HOME, LEAST_M).obstruction()
-    assert "leaves the fence by" in near and "limits.fence_radius_m 4.04" in near
-    assert near.startswith(("its join", "the stop after it"))
+    assert near is not None
+    assert "leaves the fence by" in near.sentence and "limits.fence_radius_m 4.04" in near.sentence
+    assert near.sentence.startswith(("its join", "the stop after it"))
     inside = Course(circle, with_limits(fence_radius_m=3.0), hold, 0.0, HOME, LEAST_M).obstruction()
-    assert "leaves the fence by" in inside
+    assert inside is not None
+    assert "leaves the fence by" in inside.sentence
     low = Course(circle, with_limits(fence_height_m=5.5), hold, 0.0, HOME, LEAST_M).obstruction()
-    assert "rises 0.50 m above limits.fence_height_m 5.5" in low
+    assert low is not None
+    assert "rises 0.50 m above limits.fence_height_m 5.5" in low.sentence
 
 
 NORTH = Fence((Polygon(((-5.0, -5.0), (25.0, -5.0), (25.0, 5.0), (-5.0, 5.0)), True),))

@@ -286,13 +286,19 @@ def test_toml_under_another_name_is_refused_before_it_is_sent(tmp_path, monkeypa
     assert (out, err) == ("", f"companion: --name {arguments[-1]}: {why}; name it {better}\n")
 
 
-def test_the_reader_s_notes_come_first(server, tmp_path, monkeypatch, capsys):
+def joined(server, monkeypatch) -> Network:
+    """The command line's link leads to the server, in the network's own time."""
     network = Network(server)
     network.close = lambda: None
     monkeypatch.setattr("companion.ground.upload.Wire.open", lambda *_, **__: network)
     defaults = Files.__init__.__kwdefaults__
     monkeypatch.setitem(defaults, "clock", network.clock)
     monkeypatch.setitem(defaults, "sleep", network.sleep)
+    return network
+
+
+def test_the_reader_s_notes_come_first(server, tmp_path, monkeypatch, capsys):
+    joined(server, monkeypatch)
     lap = tmp_path.parent / "lap.csv"
     lap.write_text("east,north,up,yaw_deg\n0,0,5,0\n5,0,5,0\n")
     assert main(["upload", str(lap)]) == 0
@@ -306,12 +312,7 @@ def test_the_reader_s_notes_come_first(server, tmp_path, monkeypatch, capsys):
 
 
 def test_a_name_that_fits_is_taken(server, tmp_path, monkeypatch, capsys):
-    network = Network(server)
-    network.close = lambda: None
-    monkeypatch.setattr("companion.ground.upload.Wire.open", lambda *_, **__: network)
-    defaults = Files.__init__.__kwdefaults__
-    monkeypatch.setitem(defaults, "clock", network.clock)
-    monkeypatch.setitem(defaults, "sleep", network.sleep)
+    joined(server, monkeypatch)
     lap = tmp_path.parent / "lap.csv"
     lap.write_text("0,0,5\n5,0,5\n")
     for arguments in (
@@ -324,12 +325,7 @@ def test_a_name_that_fits_is_taken(server, tmp_path, monkeypatch, capsys):
 
 
 def test_the_commands(server, tmp_path, monkeypatch, capsys):
-    network = Network(server)
-    network.close = lambda: None
-    monkeypatch.setattr("companion.ground.upload.Wire.open", lambda *_, **__: network)
-    defaults = Files.__init__.__kwdefaults__
-    monkeypatch.setitem(defaults, "clock", network.clock)
-    monkeypatch.setitem(defaults, "sleep", network.sleep)
+    joined(server, monkeypatch)
     good, bad = tmp_path.parent / "good.csv", tmp_path.parent / "bad.csv"
     good.write_bytes(b"1,2\n")
     bad.write_bytes(b"bad\n")
