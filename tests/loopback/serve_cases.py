@@ -161,10 +161,13 @@ class PlainTool:
         self.sock.sendto(message.pack(self.mav), self.companion)
 
     def receive(self, seconds: float = 0.2) -> None:
+        """Hear the companion, and not the one of another test that still speaks to whoever had this port before."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             with contextlib.suppress(TimeoutError):
-                self.heard += self.mav.parse_buffer(bytearray(self.sock.recv(2048))) or []
+                datagram, sender = self.sock.recvfrom(2048)
+                if sender == self.companion:
+                    self.heard += self.mav.parse_buffer(bytearray(datagram)) or []
 
     def command(self, command: int, *params: float, whole: bool = False, confirmation: int = 0) -> list[int]:
         """Gives a command; returns the results of its acknowledgements, the last one final."""
