@@ -11,7 +11,7 @@ PIP_INSTALL := env -u PIP_TARGET -u PIP_PREFIX -u PIP_ROOT -u PIP_REQUIREMENT -u
 unexport PYTHONHOME PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: coverage mutation matrix fuzz audit demo test test-long test-plain lint format clean help
+.PHONY: coverage mutation matrix fuzz audit demo test test-programs test-long test-plain lint format clean help
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1: \2/p' Makefile
@@ -40,13 +40,16 @@ $(VENV)/.lint: pyproject.toml constraints.txt | $(PY)
 demo: $(VENV)/.run  ## Fly the paper's figure of eight on the bundled vehicle
 	$(PY) -m companion demo
 
-test: $(VENV)/.test  ## Run the tests
-	$(PY) -m pytest -n 2 --dist loadfile -m "not long"
+test: $(VENV)/.test  ## Run the tests: units, and whole flights over loopback
+	$(PY) -m pytest -n 2 --dist loadfile -m "not long" tests/unit tests/loopback
+
+test-programs: $(VENV)/.test  ## Run what starts whole programs: installed, served, killed, in browsers, with other clients
+	$(PY) -m pytest -n 2 --dist loadfile -m "not long" tests/programs tests/clients tests/px4
 
 test-long: $(VENV)/.test  ## Run the tests that take their time: whole campaigns, fault matrices, real time
 	$(PY) -m pytest -n 2 --dist loadfile -m long
 
-test-plain: $(VENV)/.test  ## Run the tests as they run where numba is not installed
+test-plain: $(VENV)/.test  ## Run both as they run where numba is not installed
 	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest -n 2 --dist loadfile -m "not long"
 
 coverage: $(VENV)/.test  ## Run the tests as plain Python and say how many branches they reach; the programs they start count

@@ -10,7 +10,8 @@ from companion import accelerate
 
 # mavutil decides at its import, once for all tests of a process, which version it begins with
 os.environ.setdefault("MAVLINK20", "1")
-sys.path.insert(0, str(Path(__file__).parent / "unit"))
+for folder in ("unit", "loopback", "programs"):
+    sys.path.insert(0, str(Path(__file__).parent / folder))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 

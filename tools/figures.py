@@ -342,7 +342,8 @@ def _resident_kb(pid: int) -> int:
 
 def opening(base: Path) -> Iterator[Row]:
     """How long a report of ten minutes takes to open in a real browser."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "unit"))
+    for tests in ("unit", "programs"):
+        sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / tests))
     from chromium import Chromium, installed
     from record_cases import PHASES, synthetic_flight
 

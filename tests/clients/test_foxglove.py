@@ -6,17 +6,13 @@ import json
 import math
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pyulog import ULog
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-
 from pymavlink.dialects.v20 import common as mavlink2
+from pyulog import ULog
 from record_cases import PHASES, synthetic_flight
 
 from companion.record.flight_log import Entry, FlightLog

@@ -13,8 +13,6 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("mavsdk", reason="the MAVSDK package is not installed")
-sys.path.insert(0, str(Path(__file__).parents[1] / "loopback"))
-
 from serve_cases import serving
 
 from sim_link.modes import Mode

@@ -11,9 +11,6 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "loopback"))
-
 from flight_cases import HOVER, Stand, make_flight
 from pymavlink import mavutil
 from test_mavproxy import Console
