@@ -44,6 +44,8 @@ class Channel:
         """Datagrams that the other side had no room for."""
         self.unreadable = 0
         """Datagrams of the other side that made no sense."""
+        self.closed = False
+        """Whether nobody holds the other end any more: neither the other process nor the supervisor."""
 
     def fileno(self) -> int:
         """File descriptor to wait on."""
@@ -78,6 +80,7 @@ class Channel:
             except OSError:
                 break
             if not datagram:
+                self.closed = True
                 break
             item = _read(datagram)
             if item is None:

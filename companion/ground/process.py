@@ -110,7 +110,8 @@ class Ground:
         self._stopping = True
 
     def run(self) -> int:
-        """Until told to stop, or until the supervisor is gone."""
+        """Until told to stop, or until supervisor and control process are gone: a flight goes on without the one, and
+        its operator must be able to end it."""
         self._report.send(ready=True)
         ticked_s = 0.0
         while not self._stopping:
@@ -137,7 +138,7 @@ class Ground:
         self._reports.tick(now_s)
         self._ports.tick(now_s)
         self._watch.tick(now_s, self._refusals())
-        if self._report.closed:
+        if self._channel.closed and self._report.closed:
             self._stopping = True
 
     def _on_copy(self, item: Copy, now_s: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import time
 from pathlib import Path
 
 import pytest
@@ -109,13 +110,17 @@ def test_a_parameters_file_that_cannot_be_used_ends_it_at_once(
 
 
 def test_the_supervisor_killed(tmp_path: Path) -> None:
-    """The flight goes on to its end; then nothing is left."""
-    with serving(tmp_path, ("short",)) as (serve, stand):
+    """The flight goes on and hears its operator; at its end nothing is left."""
+    with serving(tmp_path, ("hover",)) as (serve, stand):
         with serve.client() as client:
-            client.start("short")
+            client.start("hover")
             client.wait_for("track")
-        pids = (serve.control_pid, serve.ground_pid)
-        os.kill(serve.process.pid, signal.SIGKILL)
+            pids = (serve.control_pid, serve.ground_pid)
+            os.kill(serve.process.pid, signal.SIGKILL)
+            serve.process.wait()
+            time.sleep(1.0)  # several ticks of the ground process, which looks after its supervisor in each
+            assert client.status(5.0).phase == "track"
+            client.stop()
         until(lambda: all(not Path(f"/proc/{pid}").exists() for pid in pids))
-        assert serve.summaries()[-1]["ended"] == "the flight was completed: the vehicle is in Hold"
+        assert "the operator ends the flight (stop)" in [p["reason"] for p in serve.summaries()[-1]["phases"]]
         assert not stand.vehicle.autopilot.in_failsafe
