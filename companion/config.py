@@ -151,7 +151,8 @@ class FlightLimits(Section):
     battery_min: Annotated[float, Field(ge=0.0, lt=1.0, allow_inf_nan=False)] = 0.15
     link_silence_max_s: Positive = 2.0
     fence_radius_m: Positive | None = None
-    """Horizontal distance from home, or from where the flight began while home is not known; None: no fence."""
+    """Horizontal distance from the vehicle's own home, wherever a trajectory was planned, or from where it held before
+    the flight while home is not known; None: no fence."""
     fence_height_m: Positive | None = None
     """Above the same."""
 

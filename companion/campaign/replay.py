@@ -116,7 +116,7 @@ def replay(
         flight = adapted(flight, engagement.adaptation)
     trajectory = of_flight(flight)
     where = engagement.hold_point_m, engagement.yaw_rad, engagement.home_m
-    course = Course(trajectory, flight.vehicle, *where, flight.height_min_m)
+    course = Course(trajectory, flight.vehicle, *where, flight.height_min_m, origin=engagement.origin_m)
     for ramp in engagement.ramps:
         course.change_pace(ramp)
     tracker = controller_of(flight, engine)

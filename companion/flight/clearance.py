@@ -3,6 +3,9 @@
 A trajectory that begins or ends in motion is joined from behind and left straight ahead: ways that nobody drew, and
 that may dip below the lowest point of the trajectory itself. `Course` looks for ways that stay clear; where there is
 none the flight is refused before a setpoint goes out.
+
+Ground and the fences of the vehicle file count from the vehicle's own home, wherever a trajectory was planned. Where
+the planned home lies higher, its ground counts too.
 """
 
 from __future__ import annotations
@@ -65,7 +68,11 @@ class Clearance:
     limits: FlightLimits
     hold_point: Vec3
     home: Vec3 | None
-    """None: where the ground is is not known, and the fences of the limits count from the hold point."""
+    """The vehicle's own. None: where the ground is is not known, and the fences of the limits count from the hold
+    point."""
+    origin: Vec3 | None
+    """Where the trajectory's coordinates count from: of places on the Earth another point than home, with ground of its
+    own."""
     height_min_m: float
     """Above home."""
 
@@ -77,24 +84,31 @@ class Clearance:
             joins: it begins at the hold point, which may be lower than the least height.
         """
         times_s, points = _points(piece)
-        found = [self._ground(points, joins=joins), *self._limits(points), self._own(points)]
         worst: Breach | None = None
-        for margins, told in (entry for entry in found if entry is not None):
+        for margins, told in (*self._ground(points, joins=joins), *self._limits(points), *self._own(points)):
             at = int(np.argmin(margins))
-            if margins[at] < -ON_THE_LINE_M and (worst is None or -margins[at] > worst.by_m):
-                by_m = -float(margins[at])
+            by_m = -float(margins[at])
+            # what is no number is not clear
+            if not by_m <= ON_THE_LINE_M and (worst is None or not by_m <= worst.by_m):
                 worst = Breach(by_m, float(times_s[at]), told.format(by=by_m))
         return worst
 
-    def _ground(self, points: Array, *, joins: bool) -> tuple[Array, str] | None:
+    def _ground(self, points: Array, *, joins: bool) -> list[tuple[Array, str]]:
         if self.home is None:
-            return None
-        height_m = self.home[2] - points[:, 2]
-        least_m = self.height_min_m
-        if joins:
-            least_m = min(least_m, self.home[2] - self.hold_point[2] - HOLD_ROOM_M)
-        lowest = f"falls to {float(height_m.min()):.2f} m above home"
-        return height_m - least_m, f"{lowest}, at least {least_m:.4g} m are required (height_min_m of the flight file)"
+            return []
+        grounds = [(self.home[2], "home")]
+        if self.origin is not None and self.origin[2] < self.home[2]:  # one that is no higher asks for nothing more
+            grounds.append((self.origin[2], "the home that it was planned from"))
+        found = []
+        for down, name in grounds:
+            height_m = down - points[:, 2]
+            least_m = self.height_min_m
+            if joins:
+                least_m = min(least_m, down - self.hold_point[2] - HOLD_ROOM_M)
+            lowest = f"falls to {float(height_m.min()):.2f} m above {name}"
+            required = f"at least {least_m:.4g} m are required (height_min_m of the flight file)"
+            found.append((height_m - least_m, f"{lowest}, {required}"))
+        return found
 
     def _limits(self, points: Array) -> list[tuple[Array, str]]:
         north, east, down = self.home or self.hold_point
@@ -107,9 +121,9 @@ class Clearance:
             found.append((top_m - (down - points[:, 2]), f"rises {{by:.2f}} m above limits.fence_height_m {top_m:g}"))
         return found
 
-    def _own(self, points: Array) -> tuple[Array, str] | None:
+    def _own(self, points: Array) -> list[tuple[Array, str]]:
         margins = own_fence_margins(self.path, points)
-        return None if margins is None else (margins, "leaves the trajectory's own fence by {by:.2f} m")
+        return [] if margins is None else [(margins, "leaves the trajectory's own fence by {by:.2f} m")]
 
 
 def _points(piece: Piece) -> tuple[Array, Array]:

@@ -96,8 +96,9 @@ class Course:
         vehicle: for the limits of join and stop.
         hold_point: where the vehicle is held, NED [m].
         yaw_rad: the heading there.
-        home: the home position, NED [m], if known.
-        height_min_m: what join and stop are to stay above, over home; None: nothing is looked at but the limits.
+        home: the vehicle's own home position, NED [m], if known: ground and fences count from there.
+        height_min_m: what all of it is to stay above, over home; None: nothing is looked at but the limits.
+        origin: where a trajectory with the anchor "home" counts its coordinates from, NED [m]; None: from home.
 
     Raises:
         RefusedError: the join or the stop cannot be flown within the limits.
@@ -111,13 +112,16 @@ class Course:
         yaw_rad: float,
         home: Vec3 | None,
         height_min_m: float | None = None,
+        *,
+        origin: Vec3 | None = None,
     ) -> None:
         self.hold_point, self.yaw_rad, self.home = hold_point, yaw_rad, home
+        self.origin = home if origin is None else origin
         self._limits, self._model = limits, model = reference_limits(vehicle), point_mass(vehicle)
-        path: Anchored = anchored(trajectory, hold_point, home)
+        path: Anchored = anchored(trajectory, hold_point, self.origin)
         self._clearance: Clearance | None = None
         if height_min_m is not None:
-            self._clearance = Clearance(path, vehicle.limits, hold_point, home, height_min_m)
+            self._clearance = Clearance(path, vehicle.limits, hold_point, home, self.origin, height_min_m)
         pieces: list[Piece] = []
         self.join_s = 0.0
         if trajectory.join == "smooth":
@@ -139,7 +143,7 @@ class Course:
         self._chain = chain([*pieces, path, stopping])
         self._tempo = Tempo()
         self.moved_m: Vec3 = ZERO
-        """By how much it was moved since it was planned, NED: its hold point, path and home do not show it."""
+        """By how much it was moved since it was planned, NED: its hold point, path, home and origin do not show it."""
 
     @property
     def duration_s(self) -> float:

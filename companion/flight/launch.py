@@ -63,7 +63,7 @@ def gate(flight: Flight) -> None:
     if flight.start is not None:  # of any other it shows when the vehicle holds
         home, start = (0.0, 0.0, 0.0), flight.start
         where = start.position_m, radians(start.yaw_deg)
-        gate_course(Course(trajectory, flight.vehicle, *where, home, flight.height_min_m), home, flight.height_min_m)
+        gate_course(Course(trajectory, flight.vehicle, *where, home, flight.height_min_m))
     if by_law:
         gate_prediction(flight, trajectory, kernels("python"))
 

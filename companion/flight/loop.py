@@ -557,7 +557,9 @@ class FlightLoop:
         begin_s = self._sequence.engaged_at_s
         self._watch.begin()
         where = course.hold_point, course.yaw_rad, course.home
-        self._engagement = Engagement(begin_s, *where, state.q, thrust_n, adaptation=self._adaptation)
+        self._engagement = Engagement(
+            begin_s, *where, state.q, thrust_n, adaptation=self._adaptation, origin_m=course.origin
+        )
         self._engaged(self._engagement)
 
     def _keep_changes(self, *, ended: bool = False) -> None:

@@ -155,7 +155,7 @@ class Engagement:
     yaw_rad: float
     """The heading there."""
     home_m: Vec3 | None
-    """The home position, NED, if it was known."""
+    """The vehicle's home position, NED, if it was known."""
     attitude: Quat
     """Body to NED, at that moment."""
     thrust_n: float | None
@@ -171,11 +171,14 @@ class Engagement:
 
     adaptation: Adaptation | None = None
     """What was flown instead of what the files say; None: as they say."""
+    origin_m: Vec3 | None = None
+    """Where a trajectory with the anchor "home" counted its coordinates from, NED; None: from `home_m`, as in flights
+    that were recorded before the two were told apart: what counted from the origin then counted from there."""
 
     @classmethod
     def from_numbers(cls, entry: Mapping[str, Any]) -> Engagement:
         """Reads what `dataclasses.asdict` gave, as JSON keeps it. Raises KeyError, TypeError or ValueError."""
-        home, thrust = entry["home_m"], entry["thrust_n"]
+        home, thrust, origin = entry["home_m"], entry["thrust_n"], entry.get("origin_m")
         return cls(
             float(entry["at_s"]),
             _vector(entry["hold_point_m"]),
@@ -188,6 +191,7 @@ class Engagement:
             tuple(Reset.from_numbers(reset) for reset in entry.get("resets", ())),
             tuple((float(at_s), float(delay_s)) for at_s, delay_s in entry.get("delays", ())),
             _adaptation(entry.get("adaptation")),
+            None if origin is None else _vector(origin),
         )
 
 

@@ -442,9 +442,9 @@ class Sequence:
     def _new_course(self, hold: Vec3, yaw_rad: float, home: Vec3 | None, home_global: GeoPoint | None) -> Course:
         """Runs beside the loop: it only uses what it is given and what never changes."""
         trajectory, flight = self._trajectory, self._flight
-        place, height_min_m = home_for(trajectory, home, home_global), flight.height_min_m
-        course = Course(trajectory, flight.vehicle, hold, yaw_rad, place, height_min_m)
-        gate_course(course, home, height_min_m)
+        origin = home_for(trajectory, home, home_global)
+        course = Course(trajectory, flight.vehicle, hold, yaw_rad, home, flight.height_min_m, origin=origin)
+        gate_course(course)
         return course
 
     def _enter_offboard(self, now_s: float) -> None:

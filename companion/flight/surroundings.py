@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.control.types import Vec3
 from companion.errors import RefusedError
 from companion.flight.clearance import own_fence_margins
 from companion.flight.course import Course
@@ -80,24 +79,18 @@ def _nearest(times_s: Sequence[float], margins: NDArray[np.float64]) -> Margin:
     return Margin(float(margins[at]), times_s[at])
 
 
-def gate_course(course: Course, home: Vec3 | None, height_min_m: float) -> None:
+def gate_course(course: Course) -> None:
     """A course stays clear of ground and fences with its join and its stop, as far as home says where the ground is.
+
+    Home is the vehicle's own, as the course was given it, wherever the trajectory was planned. Before there is a
+    vehicle the planned home is taken for it.
 
     Raises:
         RefusedError: it does not; with the place where it comes nearest, or goes farthest beyond.
     """
-    name = course.path.trajectory.name
-    if home is not None and home != course.home:  # places on the Earth count from elsewhere: the ground is here too
-        times_s = grid(course.path)
-        height_m, at_s = _nearest(times_s, home[2] - batch(course.path, times_s).p[2])
-        if not height_m >= height_min_m:
-            raise RefusedError(
-                f"trajectory {name!r}: height above home falls to {height_m:.2f} m at {at_s:.2f} s, at"
-                f" least {height_min_m:g} m are required (height_min_m of the flight file)"
-            )
     obstruction = course.obstruction()
     if obstruction is not None:
-        raise RefusedError(f"trajectory {name!r}: {obstruction.sentence}")
+        raise RefusedError(f"trajectory {course.path.trajectory.name!r}: {obstruction.sentence}")
 
 
 def separation(paths: Sequence[Anchored], step_s: float = 0.02) -> tuple[Margin, tuple[int, int]] | None:

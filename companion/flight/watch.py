@@ -197,16 +197,20 @@ class Watch:
         return None if offset_ns is None else (seen.arrival_ns + offset_ns - 1000 * seen.state.t_vehicle_us) * 1e-9
 
     def _fence(self, p: Vec3, course: Course) -> str:
-        """Which fence is broken: the vehicle file's, the trajectory's own, or the autopilot's."""
+        """Which fence is broken: the vehicle file's, the trajectory's own, or the autopilot's.
+
+        The vehicle file's counts from the vehicle's own home, as the course was planned with; while that is not known,
+        from the hold point.
+        """
         limits, moved = self._limits, course.moved_m
         # after resets of the estimate the same place has other coordinates
         x, y, z = p[0] - moved[0], p[1] - moved[1], p[2] - moved[2]
-        north, east, down = course.home or course.hold_point
+        (north, east, down), named = (course.home, "home") if course.home else (course.hold_point, "the hold point")
         distance, height = math.hypot(x - north, y - east), down - z
         if limits.fence_radius_m is not None and distance > limits.fence_radius_m:
-            return f"{distance:.1f} m from home, limit {limits.fence_radius_m:g} m (limits.fence_radius_m)"
+            return f"{distance:.1f} m from {named}, limit {limits.fence_radius_m:g} m (limits.fence_radius_m)"
         if limits.fence_height_m is not None and height > limits.fence_height_m:
-            return f"{height:.1f} m above home, limit {limits.fence_height_m:g} m (limits.fence_height_m)"
+            return f"{height:.1f} m above {named}, limit {limits.fence_height_m:g} m (limits.fence_height_m)"
         own = own_fence_margins(course.path, np.array([[x, y]]))
         if own is not None and own[0] < 0.0:
             return f"{-own[0]:.1f} m beyond the fence of trajectory {course.path.trajectory.name!r}"

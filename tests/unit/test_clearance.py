@@ -55,10 +55,10 @@ def test_a_way_through_the_ground_is_refused(trajectory: Trajectory, hold: Any, 
     assert lowest_m(unseen) < LEAST_M
     course = Course(trajectory, VEHICLE, hold, 0.0, HOME, LEAST_M)
     if lowest_m(course) >= LEAST_M:  # a brisker way was found
-        gate_course(course, HOME, LEAST_M)
+        gate_course(course)
         return
     with pytest.raises(RefusedError, match=part):
-        gate_course(course, HOME, LEAST_M)
+        gate_course(course)
     found = inspect(trajectory, VEHICLE, hold_point=hold, height_min_m=LEAST_M).problems
     assert [problem.name for problem in found] == ["stop" if part.startswith("the stop") else "join"]
 
@@ -88,6 +88,11 @@ def test_a_hold_below_the_least_height_may_be_left() -> None:
     assert Course(up, VEHICLE, (0.0, 0.0, -0.3), 0.0, HOME, LEAST_M).obstruction() is None
     below = Course(HERE, VEHICLE, (0.0, 0.0, 0.2), 0.0, None, LEAST_M)
     assert below.obstruction() is None, "where the ground is is not known"
+
+
+def test_a_home_that_is_no_number_is_no_ground() -> None:
+    course = Course(SINK, VEHICLE, (5.0, 0.0, -10.0), 0.0, (0.0, 0.0, math.nan), LEAST_M, origin=HOME)
+    assert course.obstruction() is not None
 
 
 def with_limits(**limits: float) -> Vehicle:

@@ -16,6 +16,7 @@ from companion.link.operations import Operation, Result
 from companion.link.statustext import StatusTexts
 from companion.link.telemetry import VehicleState
 from companion.link.version import AutopilotVersion
+from companion.trajectory.anchored import Trajectory
 from companion.trajectory.load import of_flight
 
 PARAMETERS = {"COM_OBL_RC_ACT": 5, "COM_OF_LOSS_T": 1.0, "NAV_RCL_ACT": 2, "MAV_TYPE": 2, "THR_MDL_FAC": 0.0}
@@ -86,11 +87,13 @@ class Script:
         armed: bool = True,
         after: str = "hold",
         duration_s: float = 1.0,
+        limits: dict[str, float] | None = None,
+        trajectory: Trajectory | None = None,
     ) -> None:
         hover = {"point_m": [0.0, 0.0, 0.0]}
-        trajectory = {"name": "hover", "shape": "hover", "duration_s": duration_s, "hover": hover}
-        data = {"name": "test", "vehicle": "paper", "trajectory": trajectory, "after": after}
-        flight = build_flight(data, "test")
+        over_a_point = {"name": "hover", "shape": "hover", "duration_s": duration_s, "hover": hover}
+        data = {"name": "test", "vehicle": "paper", "trajectory": over_a_point, "after": after, "limits": limits or {}}
+        self.flight = flight = build_flight(data, "test")
         self.ops = FakeOperations()
         self.autopilot = Autopilot(modes.HOLD, modes.HOLD, armed, landed, system_status=4)
         self.autopilot.health = SystemHealth(sticks=False, fence_kept=None, can_arm=True, battery=1.0)
@@ -100,7 +103,7 @@ class Script:
         self.speed = 0.0
         self.lines: list[str] = []
         self.sequence = Sequence(
-            *(flight, of_flight(flight), self.ops, self.autopilot),  # type: ignore[arg-type]
+            *(flight, trajectory or of_flight(flight), self.ops, self.autopilot),  # type: ignore[arg-type]
             self.engaged.append,
             self.lines.append,
         )

@@ -135,18 +135,20 @@ def test_the_ground_is_kept_away_from() -> None:
     gate_place(hovering(-30.0), -40.0)
 
     # In the air, against the home that the vehicle has told.
-    def looked_at(place: Vec3, home: Vec3 | None) -> None:
-        course = Course(hovering(3.0), load_vehicle("bundled"), (0.0, 0.0, -1.0), 0.0, place, 0.5)
-        gate_course(course, home, 0.5)
+    def looked_at(height_m: float, origin: Vec3, home: Vec3 | None) -> None:
+        hold = (0.0, 0.0, -1.0)
+        gate_course(Course(hovering(height_m), load_vehicle("bundled"), hold, 0.0, home, 0.5, origin=origin))
 
     low = (0.0, 0.0, 1.0)
-    looked_at(low, low)
-    looked_at(low, None)
+    looked_at(3.0, low, low)
+    looked_at(3.0, low, None)
     with pytest.raises(RefusedError, match=r"it falls to -0\.50 m above home"):
-        gate_course(Course(hovering(-0.5), load_vehicle("bundled"), (0.0, 0.0, -1.0), 0.0, low, 0.5), low, 0.5)
-    # places on the Earth count from elsewhere: the ground is that of home all the same
-    with pytest.raises(RefusedError, match=r"height above home falls to -4\.00 m"):
-        looked_at(low, (0.0, 0.0, -6.0))
+        looked_at(-0.5, low, low)
+    # places on the Earth count from elsewhere: the ground is that of home, and of where they were planned from
+    with pytest.raises(RefusedError, match=r"it falls to -4\.00 m above home"):
+        looked_at(3.0, low, (0.0, 0.0, -6.0))
+    with pytest.raises(RefusedError, match=r"it falls to 0\.30 m above the home that it was planned from"):
+        looked_at(0.3, low, (0.0, 0.0, 6.0))
 
 
 def test_the_fence_is_a_gate() -> None:
