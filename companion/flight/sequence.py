@@ -30,7 +30,7 @@ from companion.link.operations import Operation, Operations, Retry
 from companion.link.telemetry import VehicleState
 from companion.record.summary import PhaseChange
 from companion.trajectory.anchored import Trajectory
-from companion.trajectory.earth import home_for
+from companion.trajectory.earth import counts_from
 
 STREAM_BEFORE_OFFBOARD_S = 1.0
 """Hold setpoints go out for this long before OFFBOARD is asked for; PX4 needs one, older versions more."""
@@ -442,7 +442,7 @@ class Sequence:
     def _new_course(self, hold: Vec3, yaw_rad: float, home: Vec3 | None, home_global: GeoPoint | None) -> Course:
         """Runs beside the loop: it only uses what it is given and what never changes."""
         trajectory, flight = self._trajectory, self._flight
-        origin = home_for(trajectory, home, home_global)
+        origin = counts_from(trajectory, home, home_global)
         course = Course(trajectory, flight.vehicle, hold, yaw_rad, home, flight.height_min_m, origin=origin)
         gate_course(course)
         return course

@@ -13,7 +13,7 @@ APART_MAX_M = 2000.0
 """Farther from the vehicle's home a trajectory's origin may not be: it would be another field, and north differs."""
 
 
-def home_for(trajectory: Trajectory, home: Vec3 | None, home_global: GeoPoint | None) -> Vec3 | None:
+def counts_from(trajectory: Trajectory, home: Vec3 | None, home_global: GeoPoint | None) -> Vec3 | None:
     """Return the point of the local frame that a trajectory with anchor "home" counts its coordinates from.
 
     That is the home position, unless the coordinates are places on the Earth: then it is where their origin lies, for

@@ -19,7 +19,7 @@ from companion.flight.inspection import reference_problems
 from companion.flight.surroundings import place_problems
 from companion.frames import GeoPoint, ned_from_geo
 from companion.trajectory.anchored import Origin, Trajectory, anchored
-from companion.trajectory.earth import home_for
+from companion.trajectory.earth import counts_from
 from companion.trajectory.formats import read, read_fence
 from companion.trajectory.formats.contents import Route
 from companion.trajectory.load import load
@@ -134,7 +134,7 @@ def test_altitudes_above_the_sea(tmp_path: Path) -> None:
     origin = Origin(route.origin, route.altitude_above_home)
     trajectory = Trajectory(name="a", shape=Hover(), duration_s=1.0, anchor="home", origin=origin)
     # The vehicle's home is 3 m higher than the one that was planned with.
-    home = home_for(trajectory, (0.0, 0.0, 1.0), GeoPoint(HOME[0], HOME[1], HOME[2] + 3.0))
+    home = counts_from(trajectory, (0.0, 0.0, 1.0), GeoPoint(HOME[0], HOME[1], HOME[2] + 3.0))
     assert home == pytest.approx((0.0, 0.0, 4.0), abs=1e-9)
 
 
@@ -143,7 +143,7 @@ def test_a_mission_is_flown_where_it_was_planned(vehicle: Vehicle) -> None:
     assert trajectory.anchor == "home"
     # The vehicle stands 40 m north and 30 m west of the planned home; its local frame begins elsewhere again.
     latitude, longitude = place(40.0, -30.0)
-    home = home_for(trajectory, (7.0, 8.0, -1.0), GeoPoint(latitude, longitude, 500.0))
+    home = counts_from(trajectory, (7.0, 8.0, -1.0), GeoPoint(latitude, longitude, 500.0))
     assert home == pytest.approx((7.0 - 40.0, 8.0 + 30.0, -1.0), abs=0.01)
     path = anchored(trajectory, ORIGIN, home)
     assert path.at(0.0).p == pytest.approx((-33.0, 38.0, -11.0), abs=0.02)
@@ -152,9 +152,9 @@ def test_a_mission_is_flown_where_it_was_planned(vehicle: Vehicle) -> None:
 def test_a_mission_of_another_field_is_refused(vehicle: Vehicle) -> None:
     trajectory = load(DATA / "square.plan", vehicle=vehicle)
     with pytest.raises(RefusedError, match=r"planned 5\.0 km away"):
-        home_for(trajectory, ORIGIN, GeoPoint(*place(5000.0, 0.0), 500.0))
+        counts_from(trajectory, ORIGIN, GeoPoint(*place(5000.0, 0.0), 500.0))
     with pytest.raises(RefusedError, match="has not told where on the Earth"):
-        home_for(trajectory, ORIGIN, None)
+        counts_from(trajectory, ORIGIN, None)
 
 
 def test_the_projection_is_the_inverse_of_walking_a_great_circle() -> None:

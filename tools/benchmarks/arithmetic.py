@@ -181,7 +181,7 @@ def instruction_rows(setting: Setting) -> list[Row]:
             ]
             command += ["-m", "benchmarks.arithmetic", engine, str(steps)]
             environment = {**module_environment(), "PYTHONHASHSEED": "0"}
-            done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280, check=False)
+            done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900, check=False)
             found = re.search(r"Collected : (\d+)", done.stderr)
             if found is None:
                 raise NotHereError(f"callgrind counted nothing: {done.stderr.strip()[-200:]}")
