@@ -20,6 +20,7 @@ FORCE = 21196
 _INT32_MAX = 2147483647
 _REPOSITION_CHANGE_MODE = 1
 _GROUND_SPEED = 1
+_HOME_HEIGHT_MAX_M = 1.0e6
 _AUTOTUNE_S = 20.0
 """Vehicle time that the simulated autotuning takes."""
 _RELATIVE_FRAMES = frozenset((3, 6))
@@ -203,7 +204,8 @@ class Commands:
         if command.whole(1) == 1:
             return self._autopilot.set_home(None)
         home = self._place(command)
-        if not all(map(math.isfinite, home)):
+        # Heights add up where one is meant above the home before: without a limit they outgrow the messages' fields.
+        if not all(map(math.isfinite, home)) or abs(home[2]) > _HOME_HEIGHT_MAX_M:
             return Result.DENIED
         return self._autopilot.set_home(home)
 

@@ -111,7 +111,8 @@ def consistent(kind: int, items: list[Item]) -> bool:
             continue
         count = round(item.params[0])
         corners = items[at : at + count]
-        if len(corners) < count or any((c.command, round(c.params[0])) != (item.command, count) for c in corners):
+        # The command first: what another kind of item says there need not be a number.
+        if len(corners) < count or any(c.command != item.command or round(c.params[0]) != count for c in corners):
             return False
         at += count
     return True

@@ -309,6 +309,7 @@ class Offboard:
     def _publish(self, setpoint: Setpoint | PositionSetpoint, now_us: int) -> None:
         """Send a setpoint on its way to the loops."""
         if self._delay_us > 0:
+            self._deliver(now_us)  # nobody asks for them while the rotors stand still, and they must not pile up
             self._under_way.append((now_us + self._delay_us, setpoint))
         else:
             self._arrive(setpoint)

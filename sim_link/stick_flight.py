@@ -59,10 +59,10 @@ class AttitudeSticks:
 
     def _thrust(self, throttle: float) -> float:
         """Give the thrust: the hover thrust in the middle of the stick (MPC_THR_CURVE = 0)."""
-        low, high = self._parameters.number("MPC_MANTHR_MIN"), self._parameters.number("MPC_THR_MAX")
+        low, high = (self._parameters.within(name, 0.0, 1.0) for name in ("MPC_MANTHR_MIN", "MPC_THR_MAX"))
         if self._parameters.integer("MPC_THR_CURVE") != 0:
             return low + 0.5 * (throttle + 1.0) * (high - low)
-        middle = self._parameters.number("MPC_THR_HOVER")
+        middle = self._parameters.within("MPC_THR_HOVER", 0.0, 1.0)
         return middle + throttle * ((high - middle) if throttle > 0.0 else (middle - low))
 
 

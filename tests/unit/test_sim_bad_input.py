@@ -18,6 +18,7 @@ from sim_link.fault_keys import FaultError
 from sim_link.fault_kinds import fault
 from sim_link.faults import AT_ONCE_MAX
 from sim_link.intake import ALLOWANCE_LEAST, allowance
+from sim_link.modes import Mode
 from sim_link.peer import Peer, PeerOptions
 from sim_link.vehicle import Vehicle, VehicleOptions
 from sim_link.vehicle_file import load
@@ -241,6 +242,54 @@ def test_the_velocity_integral_stays_finite_whatever_the_gains() -> None:
         v.tick()
         assert is_finite(v)
     assert v.autopilot.mode.name == "OFFBOARD"
+
+
+def test_a_polygon_with_something_else_between_its_corners_is_none() -> None:
+    corner = missions.Item(0, missions.POLYGON_IN, 0, 1, (3.0, 0.0, 0.0, 0.0), 473977420, 85455940, 0.0)
+    for number in (math.nan, math.inf):
+        stranger = corner._replace(command=missions.RETURN_POINT, params=(number, 0.0, 0.0, 0.0))
+        assert missions.refusal(missions.FENCE, stranger) == missions.ACCEPTED
+        assert not missions.consistent(missions.FENCE, [corner, stranger, corner])
+        assert not missions.consistent(missions.FENCE, [corner, corner, stranger])
+
+
+def test_home_does_not_rise_beyond_what_messages_can_tell() -> None:
+    v = vehicle()
+    home = v.autopilot.guidance.home
+    above_the_last = struct.pack("<4fiifHBBBBB", 0, 0, 0, 0, 473977420, 85455940, 3e38, 179, 1, 1, 6, 0, 0)
+    for _ in range(3):
+        v.receive(frames(framed(75, above_the_last))[0], v.companion)
+        for _ in range(60):
+            v.tick()
+    assert v.autopilot.guidance.home == home
+    assert all(v.telemetry.build(number) for number in (codec.ID_GLOBAL_POSITION_INT, 141, 242))
+
+
+@pytest.mark.parametrize("name", ["MPC_MANTHR_MIN", "MPC_THR_HOVER", "MPC_THR_MAX"])
+@pytest.mark.parametrize("value", [3.4e38, -3.4e38, math.inf, math.nan])
+@pytest.mark.parametrize("throttle", [0, 1000])
+def test_sticks_give_a_thrust_that_messages_can_tell(name: str, value: float, throttle: int) -> None:
+    v = vehicle(parameters={name: value})
+    for k in range(30):
+        v.autopilot.manual_control(z=throttle)
+        if k == 0:
+            v.autopilot.set_mode(Mode.MANUAL)
+        v.tick()
+        assert v.telemetry.build(codec.ID_ATTITUDE_TARGET)
+        assert 0.0 <= v.autopilot.held.thrust <= 1.0
+    assert v.autopilot.mode is Mode.MANUAL
+
+
+def test_setpoints_on_their_way_do_not_pile_up_while_nobody_flies_them() -> None:
+    v = Vehicle(VehicleOptions(vehicle=replace(FILE, command_delay_s=0.05), engine="python"))
+    setpoint = framed(82, struct.pack("<I4f3ffBBB", 0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 1, 1, 7))
+    for k in range(300):
+        v.receive(frames(setpoint)[0], v.companion)
+        if k == 0:
+            v.autopilot.set_mode(Mode.OFFBOARD)
+        v.tick()
+    assert v.autopilot.mode is Mode.OFFBOARD and not v.autopilot.armed
+    assert len(v.autopilot.offboard._under_way) <= 6
 
 
 def test_faults_that_are_ordered_have_an_end() -> None:
