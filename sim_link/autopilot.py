@@ -388,7 +388,12 @@ class Autopilot:
         if (self._breach is None) != (before is None):
             if self._breach is not None:
                 self._say(CRITICAL, f"Geofence violation: {self._breach}")
+            before_mode = self.mode
             self._evaluate()
+            acts = self.failsafe is not None and self.failsafe.cause is Cause.FENCE
+            if acts and self.mode is Mode.HOLD is before_mode:
+                # It may be on its way to somewhere outside (DO_REPOSITION): PX4's navigator moves that to here.
+                self.guidance.enter(Mode.HOLD, self._rigid.p, self._rigid.v, yaw_of(self._rigid.q))
 
     def report_battery(self, charge: int) -> None:
         """Take note of the battery's MAV_BATTERY_CHARGE_STATE."""

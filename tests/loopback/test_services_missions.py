@@ -321,6 +321,18 @@ def test_uploaded_areas_and_the_height_count_too():
         assert c.mode == HOLD and any("altitude" in text for text in c.texts())
 
 
+def test_a_fence_that_holds_stops_who_is_sent_out_of_it_in_hold():
+    with breach(2) as c:
+        place = (47.397742 + 60.0 * METRE * 1e-7, 8.545594, 489.4 + 20.0)
+        assert c.command(mavlink.MAV_CMD_DO_REPOSITION, -1.0, 1.0, 0.0, math.nan, *place) == 0
+        c.until(lambda: any(text.startswith("Geofence violation") for text in c.texts()), 15.0)
+        c.run(8.0)
+        assert c.mode == HOLD
+        assert 10.0 < c.position[0] < 18.0, "it stops there and then"
+        assert c.command(mavlink.MAV_CMD_DO_REPOSITION, -1.0, 1.0, 0.0, math.nan, *place) == 0
+        c.until(lambda: c.position[0] > 50.0, 30.0)  # who orders it again means it
+
+
 def test_outside_of_the_fence_nobody_arms():
     far = [item(5003, 100.0, 0.0, params=(5.0, 0.0, 0.0, 0.0), frame=0)]
     with Flight(file=QUICK) as c:
