@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from contextlib import suppress
 from math import isfinite
 from types import FrameType
 
@@ -44,8 +45,9 @@ def refuse(sentence: str) -> None:
 
 
 def tell(sentence: str) -> None:
-    """Say something on the console."""
-    typer.echo(f"sim-link: {sentence}", err=True)
+    """Say something on the console. That nobody can read it there any more does not end a flight."""
+    with suppress(OSError, ValueError):  # a closed pipe, a full disk; a stream that was never there
+        typer.echo(f"sim-link: {sentence}", err=True)
 
 
 def number(value: float, option: str, above: float | None = None) -> float:

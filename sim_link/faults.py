@@ -10,6 +10,7 @@ import heapq
 import math
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -223,18 +224,26 @@ class Faults:
 
     def close(self) -> None:
         """Complete the log; doing so twice is harmless."""
-        if self._log is not None:
-            self._log.close()
-            self._log = self._log_path = None
+        log, self._log, self._log_path = self._log, None, None
+        if log is not None:
+            with suppress(OSError):  # what could not be written before
+                log.close()
 
     def _report(self, number: int, event: str, fault: Fault, remark: str) -> None:
         """Tell that a fault begins, happens or ends."""
         more = f" ({remark})" if remark else ""
         self.tell(f"{self.elapsed_s:.3f} s: fault {number} {event}: {fault}{more}")
-        if self._log is None and self._log_path is not None:
-            self._log = self._log_path.open("w", encoding="utf-8", newline="")
-            self._write(LOG_COLUMNS)
-        self._write((f"{self.elapsed_s:.6f}", str(number), event, str(fault), remark))
+        path = self._log_path
+        if path is None:
+            return
+        try:
+            if self._log is None:
+                self._log = path.open("w", encoding="utf-8", newline="")
+                self._write(LOG_COLUMNS)
+            self._write((f"{self.elapsed_s:.6f}", str(number), event, str(fault), remark))
+        except OSError as error:  # a vehicle does not fall out of the air because a disk is full
+            self.close()
+            self.tell(f"{path.name}: {error.strerror}; nothing more is written, the flight goes on")
 
     def _write(self, cells: Sequence[str]) -> None:
         if self._log is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from .airframe import Truth
@@ -60,7 +61,8 @@ class TruthLog:
                 content = content[self._file.write(content) or 0 :]
         except OSError as error:  # a vehicle does not fall out of the air because a disk is full
             self._full = True
-            print(
-                f"sim-link: {self._name}: {error.strerror}; nothing more is written, the flight goes on",
-                file=sys.stderr,
-            )
+            with suppress(OSError):  # the console may be a file on the same disk
+                print(
+                    f"sim-link: {self._name}: {error.strerror}; nothing more is written, the flight goes on",
+                    file=sys.stderr,
+                )

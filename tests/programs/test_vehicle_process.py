@@ -205,6 +205,18 @@ def test_bad_input_is_refused_in_one_line(options, word, capsys):
     assert err.count("\n") == 1 and word in err
 
 
+def test_a_vehicle_flies_on_when_nobody_reads_its_console_any_more(tmp_path):
+    faults = tmp_path / "faults.toml"
+    faults.write_text('[[fault]]\nkind = "wind"\nstart_s = 0.2\nend_s = 0.4\nwind_m_s = [1.0, 0.0, 0.0]\n')
+    path = tmp_path / "truth.csv"
+    options = ("--truth", str(path), "--faults", str(faults), "--start", "0,0,-20", "--duration", "1", "--no-ground")
+    process, _ = start(*options)
+    process.stderr.close()
+    assert process.wait(timeout=20) == 0
+    process.stdout.close()
+    assert float(rows(path)[-1]["t_s"]) - float(rows(path)[0]["t_s"]) == pytest.approx(1.0, abs=0.05)
+
+
 def test_interrupt_leaves_a_complete_truth_file_and_no_trace(tmp_path):
     path = tmp_path / "truth.csv"
     process, _ = start("--truth", str(path), "--lockstep")

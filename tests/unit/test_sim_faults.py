@@ -245,6 +245,27 @@ def test_faults_begin_and_end_with_the_states_and_tell_it(tmp_path: Path) -> Non
     assert rows[1]["fault"] == "force force_n = [1, 0, 0]"
 
 
+@pytest.mark.parametrize("full", [True, False])
+def test_a_vehicle_flies_on_when_its_faults_cannot_be_written_down(tmp_path: Path, full: bool) -> None:
+    if full and not Path("/dev/full").exists():
+        pytest.skip("there is no disk that is always full")
+    vehicle = make(fault("rotor", 0.1, 0.2, rotor=3, share=0.5))
+    told: list[str] = []
+    vehicle.faults.tell = told.append
+    path = tmp_path / "sub" / "truth.faults.csv"
+    path.parent.mkdir()
+    vehicle.faults.log_to(path)
+    if full:
+        path.symlink_to("/dev/full")
+    else:
+        path.parent.rmdir()
+    run(vehicle, 0.3)
+    assert vehicle.faults.elapsed_s >= 0.3 and not vehicle.faults.active
+    assert [sentence for sentence in told if "the flight goes on" in sentence] == [told[1]]
+    assert told[1].startswith("truth.faults.csv: No s")
+    vehicle.faults.close()
+
+
 def test_without_faults_nothing_is_asked_and_nothing_is_written(tmp_path: Path) -> None:
     vehicle = make()
     vehicle.faults.log_to(tmp_path / "truth.faults.csv")
