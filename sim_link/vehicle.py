@@ -35,7 +35,7 @@ from .messages_slow import SlowTelemetry
 from .missions import Plans
 from .modes import Mode
 from .offboard import Order
-from .parameter_set import DEFAULTS
+from .parameter_set import DEFAULTS, READ_ONLY
 from .parameters import Parameters
 from .rotation import Vec3
 from .services import Services
@@ -52,6 +52,9 @@ _PARAMETERS_PER_S = 2000
 _TEXTS_MAX = 8
 """Sentences of one state that are sent: a flood of requests that are refused must not become one of texts."""
 _TRUTH_PERIOD_US = 40_000
+# Far beyond what anybody means, and far from what 32 bits hold.
+_PLACE_MAX_M, _FORCE_MAX_N, _WIND_MAX_M_S, _TURBULENCE_MAX, _GRAVITY_FACTOR_MAX = 1.0e6, 1.0e5, 1.0e3, 100.0, 100.0
+_SEED_MAX = 2**62
 
 
 _OF_THE_PAST = frozenset(
@@ -144,7 +147,8 @@ class Vehicle:
         """Build the vehicle.
 
         Raises:
-            VehicleError: no whole number of loop steps fits between two states, or a choice is unknown.
+            VehicleError: no whole number of loop steps fits between two states, a choice is unknown, a number is beyond
+                what can be simulated, or a parameter is not to be chosen.
             ParameterError: a parameter that does not exist.
             FaultError: faults that cannot be at the same time, or of a parameter that does not exist.
         """
@@ -152,6 +156,7 @@ class Vehicle:
             raise VehicleError(f"px4 version {options.px4!r}: allowed are {', '.join(PX4_VERSIONS)}")
         if options.signing_key is not None and options.px4 == "1.13":
             raise VehicleError("PX4 1.13 does not sign messages: leave the key out, or be 1.18")
+        _check_numbers(options)
         self.keyring = Keyring(options.signing_key, options.signing_time)
         """The key of its links."""
         self.options = options
@@ -161,6 +166,7 @@ class Vehicle:
         from_file = _from_vehicle_file(file, self.system, options.px4)
         self._untouched = Parameters(options.px4, from_file)
         self.parameters = Parameters(options.px4, from_file | dict(options.parameters))
+        _check_fixed(self.parameters, self._untouched)
         self.airframe = Airframe(
             file,
             options.world,
@@ -471,6 +477,32 @@ class Vehicle:
         """Hand changed parameters of the inner loops over to them."""
         self._parameters_version = self.parameters.version
         self.airframe.set_gains(_gains(self.options.vehicle, self.parameters, self._untouched))
+
+
+def _check_numbers(options: VehicleOptions) -> None:
+    """Refuse what would outgrow the numbers of the messages. Raises VehicleError."""
+    world, start = options.world, options.start
+    limits = (
+        ("start [m]", (*start[0], start[1]) if start is not None else (), _PLACE_MAX_M),
+        ("place [m]", options.place_m, _PLACE_MAX_M),
+        ("force [N]", world.force_n, _FORCE_MAX_N),
+        ("wind [m/s]", world.wind_m_s, _WIND_MAX_M_S),
+        ("turbulence", (world.turbulence,), _TURBULENCE_MAX),
+        ("gravity factor", (world.gravity_factor,), _GRAVITY_FACTOR_MAX),
+        ("seed", (options.seed, world.seed), _SEED_MAX),
+    )
+    for what, numbers, limit in limits:
+        for number in numbers:
+            if not -limit <= number <= limit:
+                raise VehicleError(f"{what} {number!r:.30}: allowed is up to {limit:g}")
+
+
+def _check_fixed(parameters: Parameters, untouched: Parameters) -> None:
+    """Refuse parameters whose value would not be what is flown. Raises VehicleError."""
+    for name in sorted(READ_ONLY | {"MAV_SYS_ID", "MAV_COMP_ID"}):
+        if parameters[name] != untouched[name]:
+            why = "the vehicle file says it" if name in READ_ONLY else "the instance says who the vehicle is"
+            raise VehicleError(f"{name} = {parameters[name]:g}: must be {untouched[name]:g}, {why}")
 
 
 def _steps_per_tick(file: VehicleFile) -> int:

@@ -183,7 +183,16 @@ BAD = [
     (("--param", "NAV_RCL_ACT=1.5"), "NAV_RCL_ACT"),
     (("--param", "NAV_RCL_ACT"), "NAME=VALUE"),
     (("--gravity-factor", "nan"), "--gravity-factor"),
+    (("--gravity-factor", "1e30"), "gravity factor"),
     (("--speed", "0"), "--speed"),
+    (("--start", "0,0,-1e300"), "start"),
+    (("--force", "1e300,0,0"), "force"),
+    (("--wind", "0,1e300,0"), "wind"),
+    (("--turbulence", "1e300"), "turbulence"),
+    (("--seed", "1" + 400 * "0"), "seed"),
+    (("--param", "CA_ROTOR0_PX=5"), "the vehicle file says it"),
+    (("--param", "MAV_SYS_ID=7"), "must be 1, the instance says"),
+    (("--param", "MAV_COMP_ID=7"), "MAV_COMP_ID"),
     (("--truth", "/no/such/folder/truth.csv"), "/no/such/folder/truth.csv"),
 ]
 
