@@ -14,6 +14,7 @@ from .codec import ActuatorControls, AttitudeTarget
 from .failsafe import Action, Cause, Decision, Health, decide, without_estimate
 from .geofence import Geofence
 from .guidance import Guidance
+from .hover_thrust import HoverThrust
 from .inner_loops import ATTITUDE, STOPPED_SETPOINT, Setpoint
 from .land_detector import LandDetector, Motion
 from .manual_control import ManualInput
@@ -24,7 +25,7 @@ from .orders import Orders
 from .parameters import Parameters
 from .physics import RigidState
 from .position_loop import PositionSetpoint
-from .rotation import Vec3, from_yaw, multiply, yaw_of
+from .rotation import Vec3, body_z, from_yaw, multiply, yaw_of
 from .watch import DisarmTimer, TiltWatch
 
 HEALTH_PERIOD_US = 100_000
@@ -80,6 +81,7 @@ class Autopilot:
         self.offboard = Offboard(parameters, px4, system, setpoint_delay_us)
         self.guidance = Guidance(parameters, home, self.plans)
         self.land = LandDetector(parameters, landed=not in_air)
+        self._hover = HoverThrust(parameters, home[2] if in_air else rigid.p[2])
         self.armed = in_air
         self.mode = Mode.HOLD
         """What is flown (nav_state)."""
@@ -107,7 +109,7 @@ class Autopilot:
         self._lost_us: dict[Cause, int] = {}
         self._disarm_timer = DisarmTimer(parameters)
         self._tilt = TiltWatch(parameters)
-        self._orders = Orders(parameters, self.offboard, self.guidance, self.land, self.sticks)
+        self._orders = Orders(parameters, self.offboard, self.guidance, self.land, self.sticks, self._hover)
         self._fence_us = now_us
         self._breach: str | None = None
         self._fence_overruled = False
@@ -259,6 +261,7 @@ class Autopilot:
         self.guidance.shift(dp_m, dv_m_s, dyaw_rad)
         self.offboard.shift(dp_m, dv_m_s, dyaw_rad)
         self._orders.shift(dv_m_s, dyaw_rad)
+        self._hover.shift(dp_m, dv_m_s)
         if self.held.mode == ATTITUDE and dyaw_rad != 0.0:
             self.held = self.held._replace(q=multiply(from_yaw(dyaw_rad), self.held.q))
 
@@ -348,8 +351,12 @@ class Autopilot:
             climb_controlled,
             climb_controlled and self._orders.descends(self.mode, now_us, rigid.p),
             self.armed,
+            self._hover.value,
         )
         self.land.update(motion, now_us)
+        if self.estimate_ok:
+            up = thrust * body_z(rigid.q)[2]
+            self._hover.update(now_us, rigid.p, rigid.v, up, armed=self.armed, landed=self.land.landed)
         if not self.armed:
             return
         self._took_off = self._took_off or not self.land.landed

@@ -16,10 +16,10 @@ _STAGE_US = 333_000
 _VERTICAL_MAX_M_S = 0.25
 _HORIZONTAL_MAX_M_S = 1.5
 _ROTATION_MAX_RAD_S = math.radians(20.0)
-_THROTTLE_MARGIN = 0.3
-"""Share of (hover - minimum thrust) under which the throttle counts as low, while the hover thrust is not estimated."""
-_DESCENT_THRUST_MAX = 0.8
-"""Share of the hover thrust under which a commanded descent that goes nowhere is taken for the ground."""
+_LOW_THRUST, _LOW_THRUST_ESTIMATED = 0.3, 0.6
+"""Share of (hover - minimum thrust) under which the throttle is low: by MPC_THR_HOVER, and by a valid estimate."""
+_IDLE_THRUST = 0.1
+"""Share of the same under which a climb-rate controller has given up."""
 _FREE_FALL_M_S2 = 2.0
 
 
@@ -37,6 +37,8 @@ class Motion(NamedTuple):
     descending: bool
     """Whether a climb-rate controller is told to go down."""
     armed: bool
+    hover: float | None = None
+    """Hover thrust as it is estimated; None: no estimate is valid."""
 
 
 class LandDetector:
@@ -48,6 +50,10 @@ class LandDetector:
         self.maybe_landed = landed
         self.landed = landed
         self._since_us: list[int | None] = [None, None, None]
+        self._hover: float | None = None
+        """The last valid estimate of the hover thrust."""
+        self._estimated = False
+        """Whether it counts as one: what ends during a descent goes on to."""
         self._vertical_m_s = 0.0
         self._at_us: int | None = None
 
@@ -73,17 +79,26 @@ class LandDetector:
         """Tell whether the vehicle neither moves nor holds itself up."""
         v_n, v_e, v_d = motion.v
         moving = abs(v_d) > _VERTICAL_MAX_M_S or math.hypot(v_n, v_e) > _HORIZONTAL_MAX_M_S
+        if motion.hover is not None:
+            self._hover = motion.hover
+        if motion.hover is not None or not motion.descending:
+            self._estimated = motion.hover is not None
+        low = motion.thrust <= self._above_minimum(_LOW_THRUST_ESTIMATED if self._estimated else _LOW_THRUST)
+        # Who controls the climb rate may hover with any thrust: only going down can end on the ground.
+        arrives = not motion.climb_controlled or motion.descending or self.maybe_landed or self.landed
+        return low and arrives and not moving
+
+    def _above_minimum(self, share: float) -> float:
+        """Give the thrust this share of the way from the least to the one that hovers."""
         minimum = self._parameters.number("MPC_THR_MIN")
-        hover = self._parameters.number("MPC_THR_HOVER")
-        low = motion.thrust <= minimum + _THROTTLE_MARGIN * (hover - minimum)
-        if motion.climb_controlled and motion.descending:
-            low = motion.thrust <= _DESCENT_THRUST_MAX * hover
-        return low and not moving
+        hover = self._parameters.number("MPC_THR_HOVER") if self._hover is None else self._hover
+        return minimum + share * (hover - minimum)
 
     def _idles(self, motion: Motion) -> bool:
         """Tell whether the thrust is at its minimum."""
-        name = "MPC_THR_MIN" if motion.climb_controlled else "MPC_MANTHR_MIN"
-        return motion.thrust <= self._parameters.number(name) + 0.01
+        if motion.climb_controlled:
+            return motion.thrust <= self._above_minimum(_IDLE_THRUST)
+        return motion.thrust <= self._parameters.number("MPC_MANTHR_MIN") + 0.01
 
     def _falls(self, motion: Motion, now_us: int) -> bool:
         """Tell whether the vehicle is in free fall, judged by its vertical acceleration."""

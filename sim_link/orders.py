@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from .guidance import Guidance
+from .hover_thrust import HoverThrust
 from .inner_loops import STOPPED_SETPOINT, Setpoint
 from .land_detector import LandDetector
 from .manual_control import ManualInput
@@ -32,13 +33,14 @@ class Orders:
         guidance: Guidance,
         land: LandDetector,
         sticks: ManualInput,
+        hover: HoverThrust,
     ) -> None:
         self._parameters = parameters
         self._offboard = offboard
         self._guidance = guidance
         self._land = land
         self._sticks = sticks
-        self._steering = Steering(parameters)
+        self._steering = Steering(parameters, hover)
         self._attitude_sticks = AttitudeSticks(parameters)
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from .guidance import Guidance
+from .hover_thrust import HoverThrust
 from .inner_loops import RATES, Setpoint
 from .parameters import Parameters
 from .physics import RigidState
@@ -15,8 +16,9 @@ from .position_loop import (
     initial_position_state,
     position_control,
 )
-from .rotation import Vec3
+from .rotation import Vec3, body_z
 
+_GRAVITY_M_S2 = 9.80665
 IDLE = Setpoint(RATES, 0.0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), math.nan, (0.0, 0.0, 0.0))
 """Armed on the ground: rotors turning, no thrust."""
 
@@ -34,8 +36,13 @@ _RANGES = {
 class Steering:
     """The position controller and what it remembers while it is in charge."""
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, hover: HoverThrust) -> None:
         self._parameters = parameters
+        self._hover = hover
+        self._hover_share: float | None = None
+        """The estimate of the hover thrust that came last, which goes on when it is valid no more."""
+        self._up = 0.0
+        """The upward part of the thrust that was given last."""
         self._values = PositionParameters()
         self._version = -1
         self._state: PositionState | None = None
@@ -68,6 +75,9 @@ class Steering:
         if self._version != self._parameters.version:
             self._version = self._parameters.version
             self._values = position_parameters(self._parameters)
+            if self._hover_share is not None:
+                self._values = self._values._replace(MPC_THR_HOVER=self._hover_share)
+        self._take_hover_thrust()
         state = initial_position_state(rigid.v) if self._state is None else self._state
         values = self._values
         if self._ramp_s is not None:
@@ -80,7 +90,20 @@ class Steering:
                 self._ramp_s = None
         self.target = target
         setpoint, self._state = position_control(rigid.p, rigid.v, rigid.q, target, state, values, dt_s)
+        self._up = setpoint.thrust * body_z(setpoint.q)[2]
         return setpoint
+
+    def _take_hover_thrust(self) -> None:
+        """Reckon with the hover thrust as it is estimated now; the integral makes up for it, and the thrust stays."""
+        share, before = self._hover.value, self._values.MPC_THR_HOVER
+        if share is None or share == before:
+            return
+        self._hover_share = share
+        self._values = self._values._replace(MPC_THR_HOVER=share)
+        if self._state is not None:
+            north, east, down = self._state.integral
+            down += _GRAVITY_M_S2 * self._up * (1.0 / before - 1.0 / share)
+            self._state = self._state._replace(integral=(north, east, down))
 
 
 def position_parameters(parameters: Parameters) -> PositionParameters:
