@@ -482,6 +482,9 @@ class Vehicle:
 def _check_numbers(options: VehicleOptions) -> None:
     """Refuse what would outgrow the numbers of the messages. Raises VehicleError."""
     world, start = options.world, options.start
+    for what, vector in (("force", world.force_n), ("wind", world.wind_m_s)):
+        if len(vector) != 3:
+            raise VehicleError(f"{what} {vector!r}: must be three numbers north, east, down")
     limits = (
         ("start [m]", (*start[0], start[1]) if start is not None else (), _PLACE_MAX_M),
         ("place [m]", options.place_m, _PLACE_MAX_M),

@@ -156,6 +156,10 @@ def test_waiting_ends_with_how_the_vehicle_is() -> None:
         ({"parameters": {"NO_SUCH": 1}}, "NO_SUCH"),
         ({"px4": "1.0"}, "1.0"),
         ({"engine": "fast"}, "fast"),
+        ({"wind_m_s": (1.0, 2.0)}, "wind (1.0, 2.0): must be three numbers"),
+        ({"force_n": (1e300, 0.0, 0.0)}, "force [N] 1e+300"),
+        ({"start": (0.0, 0.0, -1e300)}, "start [m] -1e+300"),
+        ({"parameters": {"MAV_SYS_ID": 9}}, "MAV_SYS_ID = 9"),
     ],
 )
 def test_options_that_cannot_be_are_refused(options: dict, sentence: str) -> None:
