@@ -163,6 +163,8 @@ def _reason(ended: str, flown: Whole, error: FloatArray, below_m: float, settled
         return f"touched the ground at {at_s:.2f} s"
     if settled:
         return ""
+    if at_s < flown.course.join_s:
+        return f"it ended at {at_s:.2f} s, while the trajectory was still being joined ({flown.course.join_s:.2f} s)"
     return f"the error was {float(error[-1]):.3g} m at the end and did not stay below {below_m:g} m"
 
 

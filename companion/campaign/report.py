@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.campaign import pictures
-from companion.campaign.outcome import MEASURES
+from companion.campaign.outcome import MEASURES, RAISED
 from companion.campaign.sensitivity import Sensitivity
 from companion.campaign.store import REPORT_FILE, SUMMARY_FILE, open_folder, read_flights
 from companion.campaign.study import Study
@@ -96,14 +96,14 @@ def _figures(
             ],
             _TALL_PX,
         )
+    planned_s = _planned_s(study, table)
     step = max(1, len(table) // BANDS_MAX)
     errors = read_flights(folder, ["ended", "error_m"])
-    planned_s = _planned_s(study)
     some = errors if step == 1 else errors.take(list(range(0, len(errors), step)))
     add(
         "The error over time",
         "Percentiles over all flights; one that has ended counts as infinitely far. Dotted: the bound of convergence.",
-        [pictures.bands(study, some, planned_s)],
+        [pictures.bands(study, some, planned_s)] if planned_s is not None else [],
         _TALL_PX,
     )
     ranked = {
@@ -130,11 +130,18 @@ def _figures(
     return figures, sections
 
 
-def _planned_s(study: Study) -> float:
-    """Length of the flights' time axis: that of the first one; of a study that varies it, about."""
+def _planned_s(study: Study, table: Any) -> float | None:
+    """Length of the flights' time axis: that of the first one that was flown; of a study that varies it, about.
+
+    None: none was flown.
+    """
     from companion.campaign.whole import clock_of, course_of, simulated
 
-    case = study.case(0)
+    flown = (number for number, ended in zip(table["flight"], table["ended"], strict=True) if ended.as_py() != RAISED)
+    first = next(flown, None)
+    if first is None:
+        return None
+    case = study.case(first.as_py())
     course = course_of(case, clock_of(case, simulated(case.vehicle)))
     return min(course.duration_s, case.duration_s)
 

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from companion.campaign.variables import NAMES, VARIABLES, Spread, problem
-from companion.campaign.whole import Case, Throw
+from companion.campaign.whole import Case, Throw, check_vehicle, simulated
 from companion.config import (
     Controller,
     Flight,
@@ -281,10 +281,14 @@ def _check_whole(study: Study) -> None:
                 )
     if study.flight.output.controller != "law" or study.flight.output.by_law == "actuators":
         raise InputError(
-            f"{source}: flight = {file.flight!r}: a campaign flies the law with output.kind"
-            ' = "rates" or "attitude", and this flight does not'
+            f"{source}: flight = {file.flight!r}: campaigns and the search for gains fly the law with output.kind"
+            ' = "auto", "rates" or "attitude", and this flight does not'
         )
-    study.case(0)
+    case = study.case(0)
+    try:
+        check_vehicle(case, simulated(study.flight.vehicle))  # what is varied may make one that is none: a result
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
 
 
 def _case(study: Study, values: Mapping[str, Value], seed: int, where: str) -> Case:

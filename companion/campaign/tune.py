@@ -81,6 +81,8 @@ class Score(NamedTuple):
     actuation_rad_s2: float
     converged: int
     flights: int
+    lost: str = ""
+    """What became of the first flight that does not count as converged; empty where all do."""
 
 
 @dataclass(frozen=True)
@@ -179,13 +181,14 @@ def score(study_json: str, gains: Mapping[str, float], wish: Wish, first: int, e
 def _flown(
     study: Study, changes: Mapping[str, float], wish: Wish, first: int, engine: str, least: float, margin_s: float
 ) -> Score:
-    cost, rms, actuation, converged = 0.0, [], [], 0
+    cost, rms, actuation, converged, lost = 0.0, [], [], 0, ""
     for number in range(first, first + wish.flights):
         case = study.case_with(number % study.total, changes)
         try:
             outcome = measured(study, number % study.total, case, fly(case, engine), True)
-        except (CompanionError, ArithmeticError, ValueError):
+        except (CompanionError, ArithmeticError, ValueError) as error:
             cost += LOST + math.log(study.file.diverged_m)
+            lost = lost or " ".join(str(error).split())
             continue
         m = outcome.measures
         effort = m["actuation_rad_s2"] if math.isfinite(m["actuation_rad_s2"]) else 1.0  # lost before the trajectory
@@ -197,11 +200,12 @@ def _flown(
         else:
             worst = m["error_max_m"] if math.isfinite(m["error_max_m"]) else study.file.diverged_m
             cost += LOST + math.log(max(worst, 1.0)) + wish.actuation_weight * math.log(max(effort, 1.0))
+            lost = lost or outcome.reason or "it settled, but ended before its statistics begin"
     mean_rms = math.exp(sum(rms) / len(rms)) if rms else math.nan
     mean_actuation = math.exp(sum(actuation) / len(actuation)) if actuation else math.nan
     # the search would take NaN for the best that there is
     each, unfit = (cost / wish.flights, "") if math.isfinite(cost) else (UNFIT, "flights whose cost is no number")
-    return Score(each, unfit, least, margin_s, mean_rms, mean_actuation, converged, wish.flights)
+    return Score(each, unfit, least, margin_s, mean_rms, mean_actuation, converged, wish.flights, lost)
 
 
 def _score_of(task: tuple[str, dict[str, float], Wish, int, str]) -> Score:
@@ -297,8 +301,8 @@ def _refuse_lost(vehicle: Vehicle, found: Score, which: str) -> None:
     """Gains with which every flight is lost are nobody's choice. Raises RefusedError."""
     if found.converged == 0:
         raise RefusedError(
-            f"the best gain set for vehicle {vehicle.name!r} converges in none of {found.flights} flights {which}: ease"
-            " the study's disturbances, or fly them longer (duration_s)"
+            f"the best gain set for vehicle {vehicle.name!r} converges in none of {found.flights} flights {which} (the"
+            f" first: {found.lost}): ease the study's disturbances, or fly them longer (duration_s)"
         )
 
 

@@ -127,11 +127,7 @@ def fly(case: Case, engine: str = "auto") -> Whole:
     """
     chosen, run = kernel_of(engine)
     flight, sim = case.flight, simulated(case.vehicle)
-    if any((sim.walk_position_m, sim.walk_velocity_m_s, sim.walk_yaw_rad, sim.walk_rate_rad_s)):
-        raise InputError(
-            f"vehicle {sim.name!r}: noise.*_walk: campaigns fly with white noise alone; set the walks to 0"
-        )
-    clock = clock_of(case, sim)
+    clock = check_vehicle(case, sim)
     course, reference, time_s = _reference(case, clock)
     clock = clock._replace(states=len(time_s))
     memory, weights = memory_of(flight.vehicle, clock)
@@ -159,6 +155,15 @@ def simulated(vehicle: Vehicle) -> VehicleFile:
     except vehicle_file.VehicleFileError as error:
         raise InputError(str(error)) from None
     return found
+
+
+def check_vehicle(case: Case, sim: VehicleFile) -> Clock:
+    """The clockwork of a case whose vehicle a campaign can fly. Raises InputError where it cannot, whatever varies."""
+    if any((sim.walk_position_m, sim.walk_velocity_m_s, sim.walk_yaw_rad, sim.walk_rate_rad_s)):
+        raise InputError(
+            f"vehicle {sim.name!r}: noise.*_walk: campaigns fly with white noise alone; set the walks to 0"
+        )
+    return clock_of(case, sim)
 
 
 def clock_of(case: Case, sim: VehicleFile) -> Clock:

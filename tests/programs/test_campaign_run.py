@@ -155,6 +155,18 @@ def test_the_command_flies_says_and_draws(tmp_path, capsys, monkeypatch):
     assert row["identical"] is True and row["flight"] == 1
 
 
+@pytest.mark.parametrize(("factors", "raised"), [("[0.1, 0.11]", 6), ("[0.1, 1.0]", 3)])
+def test_flights_that_cannot_be_built_leave_a_page_all_the_same(factors, raised, tmp_path, capsys, monkeypatch):
+    """Flight 0 among them: the length of the time axis is that of one that was flown."""
+    monkeypatch.chdir(tmp_path)
+    path = tiny_file(tmp_path, count=6, more=f"thrust_factor = {{ choice = {factors} }}\n")
+    assert main(["campaign", str(path), "--workers", "1", "--engine", "python", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["ended"]["raised"] == raised
+    assert read_flights(tmp_path / "campaigns/tiny")["ended"][0].as_py() == "raised"
+    assert ("The error over time" in (tmp_path / "campaigns/tiny/report.html").read_text()) is (raised < 6)
+
+
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [

@@ -4,6 +4,7 @@ import pytest
 
 from companion.campaign.study import from_json, load_study
 from companion.campaign.variables import VARIABLES
+from companion.config import find
 from companion.errors import InputError
 from tests.unit.campaign_cases import tiny, tiny_file
 
@@ -13,6 +14,21 @@ def test_the_bundled_studies_are_sound(name):
     study = load_study(name)
     assert study.total >= 1000 and study.varied
     assert study.case(study.total - 1).flight.world.seed == study.flight_seed(study.total - 1)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("position_walk_m_per_sqrt_s = 0.0", "position_walk_m_per_sqrt_s = 0.1", "white noise alone"),
+        ("state_rate_hz = 250.0", "state_rate_hz = 300.0", "must be a whole multiple of link.state_rate_hz = 300"),
+    ],
+)
+def test_a_vehicle_that_no_campaign_can_fly_is_refused_before_anything_is_flown(tmp_path, before, after, says):
+    vehicle = find("bundled", "vehicles").read_text()
+    assert before in vehicle
+    (tmp_path / "mine.toml").write_text(vehicle.replace(before, after))
+    with pytest.raises(InputError, match=f"tiny.toml: vehicle 'bundled': .*{says}"):
+        load_study(str(tiny_file(tmp_path)), vehicle=str(tmp_path / "mine.toml"))
 
 
 def test_a_flight_follows_from_the_seed_and_its_number_alone(tmp_path):

@@ -92,6 +92,11 @@ def test_a_flight_that_is_lost_in_its_join_has_a_cost(tmp_path):
     assert (found.unfit, found.converged) == ("", 0) and tune.LOST < found.cost < tune.UNFIT
 
 
+def test_a_flight_that_ends_before_its_statistics_begin_is_not_said_to_miss_its_bound(tmp_path):
+    found = tune.score(tiny(tmp_path, duration_s=9.0).to_json(), OWN, WISH, 0, "auto")
+    assert found.converged == 0 and found.lost == "it settled, but ended before its statistics begin"
+
+
 def test_a_cost_that_is_no_number_is_that_of_gains_that_are_not_allowed(tmp_path):
     """The search would take NaN for the best that there is."""
     wish = WISH._replace(actuation_weight=math.nan)
@@ -103,7 +108,8 @@ def test_it_is_refused_when_no_flight_converges(tmp_path, monkeypatch):
     """The study ends while the trajectory is still being joined."""
     monkeypatch.setattr(tune, "POPULATION", 1)
     study = tiny(tmp_path, count=4, duration_s=0.2, more="[vary.controller]\nk1_1_s = { uniform = [1.9, 2.0] }\n")
-    with pytest.raises(RefusedError, match=r"converges in none of 1 flights of the search: ease the study's"):
+    said = r"none of 1 flights of the search \(the first: it ended at 0\.18 s, while the trajectory was still"
+    with pytest.raises(RefusedError, match=said):
         tune.tune(study, WISH, "python", generations=1, workers=1)
 
 
