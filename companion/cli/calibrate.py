@@ -111,8 +111,8 @@ def run(
         raise InputError("--sim, --connect and --from-flight say where the flight comes from: leave all but one out")
     if faults is not None and not sim:
         raise InputError(f"--faults {faults}: only for the bundled vehicle; add --sim")
-    if save is not None and save.exists():
-        raise InputError(f"{save}: is there already; name another with --save")
+    if save is not None:
+        _check_free(save)
     entered = Entered(name or template.name, mass, 0.1, sim or simulator)
     if from_flight is not None:
         folder = from_flight
@@ -226,7 +226,7 @@ def _tell_failure(flown: Flown, *, as_json: bool) -> None:
     Raises:
         Exit: always.
     """
-    said = f"{flown.sentence}; nothing was calibrated. What was flown: {flown.folder}"
+    said = f"{flown.sentence}; nothing was calibrated. The flight folder: {flown.folder}"
     say(f"companion: {said}", quiet=True)
     if as_json:
         print(
@@ -255,6 +255,11 @@ def _identify(folder: Path, template: str, entered: Entered, save: Path | None, 
         curved=not parameters.get("THR_MDL_FAC", 0.0) > 0.0,
         progress=lambda what: say(f"  fitting {what}", quiet=as_json),
     )
+    if found.rare:
+        raise RefusedError(
+            f"{folder}: states every {_ms(found.interval_s)} are too far apart to tell the lag of:"
+            f" {', '.join(found.rare)}; let them come more often (link.state_rate_hz of the vehicle file)"
+        )
     if found.lacking:
         raise RefusedError(
             f"{folder}: the flight does not tell enough about: {', '.join(found.lacking)}; larger steps or more repeats"
@@ -274,6 +279,16 @@ def _identify(folder: Path, template: str, entered: Entered, save: Path | None, 
     for warning in warnings:
         say(f"warning: {warning}")
     say(f"vehicle file: {path}")
+
+
+def _check_free(path: Path) -> None:
+    """Raise InputError where the new file could not be written: nobody wants to hear it after the flight."""
+    from companion.errors import InputError
+
+    if path.exists():
+        raise InputError(f"{path}: is there already; name another with --save")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: cannot be written: there is no folder {path.parent}; make it, or name another")
 
 
 def _default_path(folder: Path, name: str, day: str) -> Path:

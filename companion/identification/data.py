@@ -58,6 +58,11 @@ class FlightData:
         return float(sum(self.t_s[w.stop - 1] - self.t_s[w.start] for w in self.windows))
 
     @property
+    def interval_s(self) -> float:
+        """The usual time between two states."""
+        return float(np.median(np.diff(self.t_s)))
+
+    @property
     def thrust_axis(self) -> Array:
         """r3, the direction of body z, NED, shape (rows, 3)."""
         a, b, c, d = self.q.T

@@ -49,6 +49,13 @@ class Identified:
     age_s: float | None
     """Of the states at sending; None: the clocks did not tell, and the delay counts from the states' stamps."""
     duration_s: float
+    interval_s: float
+    """The usual time between two states."""
+
+    @property
+    def rare(self) -> list[str]:
+        """What the states were too far apart for, for people."""
+        return [f"{name} rate" for name, fit in zip(AXES, self.rates, strict=True) if fit is not None and fit.rare]
 
     @property
     def lacking(self) -> list[str]:
@@ -116,6 +123,7 @@ def identify(
         delay_s,
         data.age_s,
         data.duration_s,
+        data.interval_s,
     )
 
 

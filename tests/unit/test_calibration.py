@@ -158,12 +158,26 @@ def test_a_calibration_at_ten_states_a_second_integrates_and_is_identified() -> 
     assert not any("left out" in line or "early" in line for line in told), told
     found = identify(flight_data(source), flight.vehicle.autopilot.rate_integral_1_s, curved=False)
     assert found.motion.full_m_s2 == pytest.approx(20.0, rel=0.01)
+    assert found.rare == found.lacking == ["roll rate", "pitch rate"]  # of 40 ms; yaw's 80 ms are told
     still = State(ZERO, ZERO, LEVEL, ZERO)
     calibrator.begin(still)
     for t_s in (0.0, 0.112, 0.221):  # 10 Hz with jitter
         out = calibrator.step(t_s, still._replace(p=(1.0, 0.0, 0.0)), lambda t: at_rest(ZERO, 0.0))
     late = calibrator.step(0.221 + 0.3, still._replace(p=(1.0, 0.0, 0.0)), lambda t: at_rest(ZERO, 0.0))
     assert out.b_hat[0] == pytest.approx(0.15 * (0.1 + 0.112 + 0.109), rel=1e-6) and late.b_hat == out.b_hat
+
+
+@pytest.mark.parametrize(("rate_hz", "age_s"), [(10.0, 0.05), (12.5, 0.02), (20.0, 0.05), (25.0, 0.02)])
+def test_a_lag_that_rare_states_tell_is_within_its_standard_deviation(rate_hz, age_s) -> None:
+    """Loops of 20 and 40 ms: at 100 Hz their first-order lags are 33.7 and 42.3 ms."""
+    lags = {"autopilot__rate_lag_s": [0.02, 0.04, 0.08], "link__state_age_s": age_s, "link__state_rate_hz": rate_hz}
+    flight = calibration_flight({"repeats": 1}, **lags)
+    source, _, _ = fly(flight, hover_share=hover_share(flight, 0.0))
+    found = identify(flight_data(source), flight.vehicle.autopilot.rate_integral_1_s, curved=False)
+    for fit, truth_s in zip(found.rates[:2], (0.0337, 0.0423), strict=True):
+        assert fit is not None
+        assert fit.rare or abs(fit.lag_s - truth_s) < 2.0 * fit.lag_sd_s
+    assert ("roll rate" in found.rare) is (rate_hz < 15.0) and "yaw rate" not in found.rare
 
 
 def test_rate_integrals_come_from_the_parameters_where_they_are_told() -> None:
@@ -224,7 +238,7 @@ def test_a_limit_that_is_all_that_the_rotors_give_stays_within_it_after_rounding
     template = template.model_copy(update={"limits": limits})
     motion = MotionFit(full_m_s2, 0.0, 0.05, 0.0, 0.5, 0.01, 0.0, 0.001, 0.001, 0.01, 0.01)
     nothing = (None, None, None)
-    found = Identified(nothing, nothing, (0.5, 0.5, 0.5), motion, motion, 0.02, None, 60.0)
+    found = Identified(nothing, nothing, (0.5, 0.5, 0.5), motion, motion, 0.02, None, 60.0, 0.01)
     entered = Entered("mine", mass_kg, 0.1, False)
     values = vehicle_values(template, entered, found, {})
     assert values["limits.thrust_max_n"] <= 4.0 * values["rotors.thrust_max_n"]
