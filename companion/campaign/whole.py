@@ -266,11 +266,12 @@ def _reference(case: Case, clock: Clock) -> tuple[Course, FloatArray, FloatArray
     v = flight.vehicle
     delay_s = v.delay_s if v.controller.prediction else 0.0
     clockwork = (clock.dt_us, clock.per_state, clock.age)
-    key = (v.limits.model_dump_json(), v.body.model_dump_json(), v.rotors.model_dump_json())
+    key = (v.limits.model_dump_json(), v.body.model_dump_json(), v.rotors.model_dump_json(), v.controller.heading)
     position, yaw_deg = flight.start.position_m, flight.start.yaw_deg
     if trajectory.join == "law" and trajectory.anchor != "here":  # then it lies where it lies
         position, yaw_deg = ZERO, 0.0
-    return _table(_Planned(v, key), trajectory, position, yaw_deg, delay_s, clockwork, case.duration_s)
+    where = (position, yaw_deg, flight.height_min_m)
+    return _table(_Planned(v, key), trajectory, where, delay_s, clockwork, case.duration_s)
 
 
 def course_of(case: Case, clock: Clock) -> Course:
@@ -295,15 +296,15 @@ class _Planned:
 def _table(
     planned: _Planned,
     trajectory: Trajectory,
-    position_m: Vec3,
-    yaw_deg: float,
+    where: tuple[Vec3, float, float],
     delay_s: float,
     clockwork: tuple[int, int, int],
     duration_max_s: float,
 ) -> tuple[Course, FloatArray, FloatArray]:
     """See `_reference`; kept, because the flights of a study often share it."""
     dt_us, per_state, age = clockwork
-    course = Course(trajectory, planned.vehicle, position_m, radians(yaw_deg), ZERO)
+    position_m, yaw_deg, height_min_m = where
+    course = Course(trajectory, planned.vehicle, position_m, radians(yaw_deg), ZERO, height_min_m)
     wait = -(-age // per_state)
     count = int(min(course.duration_s, duration_max_s) * 1e6 / (per_state * dt_us)) - wait
     if count < 1:

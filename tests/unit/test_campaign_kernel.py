@@ -14,7 +14,7 @@ from companion.control.vectors import axes
 from companion.errors import InputError
 from companion.flight.course import Course
 from companion.flight.tracker import kernels
-from companion.trajectory.load import load, of_flight
+from companion.trajectory.load import embedded, load, of_flight
 from sim_link.wind import DRAWS_PER_PERIOD, Wind, series
 from tests.unit.campaign_cases import tiny
 
@@ -89,6 +89,18 @@ def test_a_course_at_many_instants_is_the_course_at_each(name):
     for row, t in zip(found, times_s.tolist(), strict=True):
         r = course.at(t)
         assert row == pytest.approx([*r.p, *r.v, *r.a, *r.j, *r.s, r.yaw, r.yaw_rate, r.yaw_acceleration], abs=1e-9)
+
+
+def test_the_join_stays_above_the_least_height_as_in_every_flight():
+    """A helix begins on its way up: from a metre above home the gentlest join would come from below the ground."""
+    flight = embedded(flight_of("eight", wind=False).model_copy(update={"trajectory": "helix"}))
+    start = flight.start.model_copy(update={"position_m": (1.5, -1.0, -1.0)})
+    flight = flight.model_copy(update={"start": start})
+    case = Case(flight, flight.vehicle, of_flight(flight), duration_s=4.0)
+    whole = fly(case, "auto")
+    flown = Course(case.trajectory, flight.vehicle, start.position_m, 0.0, (0.0, 0.0, 0.0), flight.height_min_m)
+    assert (whole.ended, whole.course.join_s) == (kernel.FLOWN, flown.join_s)
+    assert whole.rows[:, kernel.POSITION][:, 2].max() < -flight.height_min_m + 0.02
 
 
 def test_a_delay_that_nobody_knows_acts_after_its_steps():
