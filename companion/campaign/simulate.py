@@ -231,7 +231,10 @@ def _append(
 
 
 def fly_ideal(flight: Flight, trajectory: Trajectory, progress: Callable[[float], None] = lambda share: None) -> Trace:
-    """The paper's own setting: perfect state, law inside the integrator, torque realised exactly, no limits."""
+    """The paper's own setting: perfect state, law inside the integrator, torque realised exactly, no limits.
+
+    The mean wind acts through the drag, as a constant force; there are no gusts.
+    """
     vehicle = flight.vehicle
     position, yaw = start_of(flight)
     base = vehicle.parameters()
@@ -250,7 +253,10 @@ def fly_ideal(flight: Flight, trajectory: Trajectory, progress: Callable[[float]
         HeadingState(r2, (math.cos(yaw), math.sin(yaw), 0.0), False),
         (0.0, 0.0, 0.0),
     )
-    world = ideal.World(flight.world.force_n, GRAVITY_M_S2 * flight.world.gravity_factor, vehicle.body.drag_1_s)
+    mass, drag = vehicle.body.mass_kg, vehicle.body.drag_1_s
+    (fn, fe, fd), (wn, we, wd) = flight.world.force_n, flight.world.wind_m_s
+    force = (fn + mass * drag * wn, fe + mass * drag * we, fd + mass * drag * wd)
+    world = ideal.World(force, GRAVITY_M_S2 * flight.world.gravity_factor, drag)
     start = State(position, (0.0, 0.0, 0.0), quat_from_yaw(yaw), (0.0, 0.0, 0.0))
 
     def reference(t: float) -> Reference:
@@ -269,8 +275,6 @@ def fly_ideal(flight: Flight, trajectory: Trajectory, progress: Callable[[float]
         record.append(_ideal_row(s, ref, course, parameters))
     phases = [PhaseChange(Phase.TRACK.value, course.join_s, "simulated in the paper's ideal setting")]
     meta = FlightMeta(trajectory.name, vehicle.name, 0, flight.statistics_from_s, flight.acceptance.thresholds())
-    mass = vehicle.body.mass_kg
-    force = flight.world.force_n
     excess = GRAVITY_M_S2 * (flight.world.gravity_factor - 1.0)
     truth = (force[0] / mass, force[1] / mass, force[2] / mass + excess)
     return Trace(rows, record, summarise(record, phases, meta), truth)

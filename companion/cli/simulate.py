@@ -1,10 +1,12 @@
-"""The law that flies against the physics of the bundled vehicle, in this process. The flight file needs [start]."""
+"""The law that flies against the physics of the bundled vehicle, in this process. The flight file needs [start].
+Exit code 1: it missed the thresholds of [acceptance].
+"""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +24,10 @@ from companion.cli.common import (
     trajectory_changes,
     vehicle_changes,
 )
+
+if TYPE_CHECKING:
+    from companion.campaign.simulate import Trace
+    from companion.config import Flight, Vehicle
 
 EXAMPLE = "Example: companion simulate paper --ideal --csv paper.csv"
 
@@ -49,9 +55,10 @@ def run(
 
     from companion.campaign.simulate import fly_ideal, fly_sampled, write_csv
     from companion.config import load_flight
-    from companion.errors import InputError
+    from companion.errors import ExitCode, InputError
     from companion.flight.preflight import gate_gains, gate_reference
     from companion.flight.tracker import kernels
+    from companion.record.summary import met
     from companion.trajectory.load import embedded, of_flight
 
     changes = {**vehicle_changes(vehicle), **trajectory_changes(trajectory, frame)}
@@ -61,6 +68,10 @@ def run(
             f"flight {configured.name!r} is PX4's own controller's (output.controller); simulate computes the law"
             " alone: fly it with `companion demo`"
         )
+    if not ideal:
+        _check_rates(configured.vehicle)
+    elif configured.world.turbulence > 0.0:
+        say("the ideal setting has no gusts: the mean wind alone blows", quiet=as_json)
     path = of_flight(configured)
     say_notes(path.notes, quiet=as_json)
     gate_gains(configured.vehicle, configured.output.by_law, allow_uncertified=allow_uncertified)
@@ -77,11 +88,31 @@ def run(
             trace = fly_sampled(configured, path, kernels(engine), progress)
     if csv is not None:
         write_csv(trace, csv)
+    missed = not met(trace.summary["verdict"])
     if as_json:
         print(json.dumps(trace.summary, indent=2))
-        return
+    else:
+        _print(configured, path.name, trace, csv, ideal=ideal)
+    if missed:
+        raise typer.Exit(int(ExitCode.MISSED))
+
+
+def _check_rates(vehicle: Vehicle) -> None:
+    """Raise InputError where no state would come at its time: what is simulated would be another vehicle."""
+    from companion.errors import InputError
+
+    loop_hz, states_hz = vehicle.autopilot.loop_rate_hz, vehicle.link.state_rate_hz
+    steps = loop_hz / states_hz
+    if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
+        raise InputError(
+            f"vehicle {vehicle.name!r}: autopilot.loop_rate_hz = {loop_hz:g} must be a whole multiple of"
+            f" link.state_rate_hz = {states_hz:g}"
+        )
+
+
+def _print(configured: Flight, name: str, trace: Trace, csv: Path | None, *, ideal: bool) -> None:
     setting = "the paper's ideal setting" if ideal else "sampled, with the vehicle file's lags, delay and noise"
-    say(f"{configured.name}: {path.name} on {configured.vehicle.name}, {setting}")
+    say(f"{configured.name}: {name} on {configured.vehicle.name}, {setting}")
     print_summary(trace.summary)
     truth = ", ".join(f"{x:.3f}" for x in trace.truth_disturbance_m_s2)
     say(f"  {'true disturbance':32s} ({truth}) m/s^2")

@@ -90,6 +90,35 @@ def test_simulate_prints_one_json_document(short: str, capsys: pytest.CaptureFix
     assert document(capsys)["position_max_m"] < 1e-6
 
 
+def test_simulate_ends_with_1_when_thresholds_are_missed(short: str, tmp_path: Path, capsys) -> None:
+    strict = tmp_path / "strict.toml"
+    strict.write_text(SHORT.format(bound=1e-5), encoding="utf-8")
+    assert main(["simulate", str(strict), "--engine", "python", "--json"]) == 1
+    assert document(capsys)["verdict"].startswith("missed")
+    assert main(["simulate", str(strict), "--engine", "python"]) == 1
+    assert "verdict: missed" in capsys.readouterr().out
+
+
+def test_simulate_refuses_states_that_fall_between_the_steps(short: str, tmp_path: Path, capsys) -> None:
+    """Rounded, 300 Hz would be flown as 250."""
+    odd = tmp_path / "odd.toml"
+    text = (bundled_root() / "vehicles" / "bundled.toml").read_text(encoding="utf-8")
+    odd.write_text(text.replace("state_rate_hz = 250.0", "state_rate_hz = 300.0"), encoding="utf-8")
+    assert main(["simulate", short, "--engine", "python", "--vehicle", str(odd)]) == 2
+    assert "whole multiple of link.state_rate_hz = 300" in capsys.readouterr().err
+
+
+def test_the_mean_wind_blows_in_the_ideal_setting_too(short: str, tmp_path: Path, capsys) -> None:
+    """3 m/s through a drag of 1 1/s are 3 m/s^2, most of which the estimate has found after a second."""
+    windy = tmp_path / "windy.toml"
+    world = "\n[world]\nwind_m_s = [3.0, 0.0, 0.0]\nturbulence = 0.2\n"
+    windy.write_text(Path(short).read_text(encoding="utf-8") + world, encoding="utf-8")
+    main(["simulate", str(windy), "--ideal"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "the ideal setting has no gusts" in out and "true disturbance (3.000, 0.000, 0.000) m/s^2" in out
+    assert "disturbance (north, east, down) (2." in out
+
+
 def test_simulate_writes_one_row_per_control_step(
     short: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
