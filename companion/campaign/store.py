@@ -1,7 +1,8 @@
 """A campaign's folder: the study, one Parquet file per finished batch, and in the end one for all flights.
 
 A part is written under another name and moved into place, so that what bears a part's name is whole: an interrupted
-campaign goes on with the batches that are missing.
+campaign goes on with the batches that are missing. A part that is not whole all the same (a disk that broke, a computer
+that lost its power) is one of them.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import json
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -104,6 +106,7 @@ class Store:
             raise InputError(f"{folder}: holds another study; choose another folder with --out, or remove it")
         if known is None and folder.exists() and any(folder.iterdir()):
             raise InputError(f"{folder}: is not empty, and no campaign's folder; choose another with --out")
+        self._drop_broken()
         self._check_room()
         try:
             if not self.complete:
@@ -113,6 +116,18 @@ class Store:
                 _write(whole, text.encode())
         except OSError as error:
             raise InputError(f"{folder}: cannot be written: {error.strerror}; choose another with --out") from None
+
+    def _drop_broken(self) -> None:
+        """Removes the parts that do not hold their flights. Raises InputError."""
+        if self.complete:
+            return
+        for path in list(self._parts()):
+            try:
+                first, after = self.flights_of(int(path.stem))
+                if _rows(path) != after - first:
+                    path.unlink()
+            except OSError as error:
+                raise InputError(f"{path}: cannot be removed: {error.strerror}; it is broken, remove it") from None
 
     def _check_room(self) -> None:
         existing = next(p for p in (self.folder.absolute(), *self.folder.absolute().parents) if p.exists())
@@ -176,6 +191,8 @@ class Store:
                         waiting.clear()
                 if waiting:
                     writer.write_table(pa.concat_tables(waiting).combine_chunks())
+            with unfinished.open("rb+") as file:
+                os.fsync(file.fileno())  # before the parts go
             unfinished.replace(path)
             shutil.rmtree(self.folder / PARTS)
         except OSError as error:
@@ -205,10 +222,31 @@ def read_flights(folder: Path, columns: Sequence[str] | None = None) -> Any:
     if not parts:
         raise InputError(f"{folder}: holds no finished flights yet")
     chosen = None if columns is None else list(columns)
-    return pa.concat_tables([pq.read_table(part, columns=chosen, partitioning=None) for part in parts])
+    try:
+        return pa.concat_tables([pq.read_table(part, columns=chosen, partitioning=None) for part in parts])
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(
+            f"{folder}: holds flights that cannot be read ({' '.join(str(error).split())[:160]}); `companion campaign`"
+            f" flies those of broken parts again, a broken {FLIGHTS_FILE} must be removed first"
+        ) from None
+
+
+def _rows(part: Path) -> int:
+    """Flights in a part; -1 where it cannot be read."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return int(pq.read_table(part, columns=["flight"], partitioning=None).num_rows)
+    except (OSError, pa.ArrowException):
+        return -1
 
 
 def _write(path: Path, data: bytes) -> None:
+    """Writes a file that is whole or not there, whenever the power goes."""
     unfinished = path.with_name(path.name + ".part")
-    unfinished.write_bytes(data)
+    with unfinished.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
     unfinished.replace(path)

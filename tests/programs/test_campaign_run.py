@@ -62,6 +62,19 @@ def test_an_interrupted_campaign_goes_on_with_what_is_missing(tmp_path):
     assert (tmp_path / "halves" / store.FLIGHTS_FILE).read_bytes() == (whole.folder / store.FLIGHTS_FILE).read_bytes()
 
 
+@pytest.mark.parametrize("broken", [b"", b"PAR1 and half of it"])
+def test_a_part_that_is_broken_is_flown_again(broken, tmp_path):
+    study = tiny(tmp_path, count=4)
+    whole = flown(study, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        flown(study, tmp_path / "halves", Interrupted)
+    (tmp_path / "halves" / store.PARTS / "00000001.parquet").write_bytes(broken)
+    with pytest.raises(InputError, match="holds flights that cannot be read"):
+        read_flights(tmp_path / "halves")
+    assert flown(study, tmp_path / "halves").flown == 3
+    assert (tmp_path / "halves" / store.FLIGHTS_FILE).read_bytes() == (whole.folder / store.FLIGHTS_FILE).read_bytes()
+
+
 def test_a_worker_that_is_killed_loses_nothing(tmp_path):
     study = tiny(tmp_path, count=12)
     here = flown(study, tmp_path / "here")
