@@ -8,6 +8,7 @@ against the bundled vehicle. Without FOLDER it is of the newest one in ./campaig
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,11 +44,13 @@ def run(
         int | None, typer.Option("--workers", metavar="N", min=1, help="Processes; default one per core.")
     ] = None,
     guarded: Annotated[
-        bool, typer.Option("--guarded/--unguarded", help="With replay: as it would fly, or past gates and guards.")
-    ] = True,
+        bool | None,
+        typer.Option("--guarded/--unguarded", help="With replay: as it would fly (default), or past gates and guards."),
+    ] = None,
     mavlink: Annotated[
-        bool, typer.Option("--mavlink/--no-mavlink", help="With replay: fly it over MAVLink as well.")
-    ] = True,
+        bool | None,
+        typer.Option("--mavlink/--no-mavlink", help="With replay: fly it over MAVLink as well (default), or not."),
+    ] = None,
     engine: EngineOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
@@ -55,10 +58,13 @@ def run(
     if what[0] == "replay":
         from companion.cli.campaign_replay import replay
 
+        _refuse("a replay", {"--count": count, "--seed": seed, "--scheduler": scheduler, "--workers": workers})
         folder, number = _flight_of(what[1:])
-        raise typer.Exit(replay(folder, number, out, mavlink=mavlink, guarded=guarded, engine=engine, as_json=as_json))
+        flies, guards = mavlink is not False, guarded is not False
+        raise typer.Exit(replay(folder, number, out, mavlink=flies, guarded=guards, engine=engine, as_json=as_json))
     if len(what) != 1:
         raise InputError(f"one study at a time; {' '.join(what[1:])!r} is too much (see `companion campaign --help`)")
+    _refuse("a campaign", {"--guarded/--unguarded": guarded, "--mavlink/--no-mavlink": mavlink})
     if scheduler is not None and scheduler != "local" and workers is not None:
         raise InputError("--workers is for this machine; a cluster has the workers that it has")
     from companion import accelerate
@@ -83,6 +89,14 @@ def run(
         print(json.dumps({**ran.summary, "folder": str(folder), "report": str(page)}, indent=2))
         return
     _say(ran, study, page)
+
+
+def _refuse(what: str, options: Mapping[str, object]) -> None:
+    """Raise InputError where an option is given that would change nothing."""
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        verb = "mean" if len(given) > 1 else "means"
+        raise InputError(f"{', '.join(given)}: {verb} nothing for {what} (see `companion campaign --help`)")
 
 
 def _run(study: Study, folder: Path, scheduler: str | None, workers: int | None, engine: str, as_json: bool) -> Ran:

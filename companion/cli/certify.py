@@ -108,6 +108,10 @@ def _flight(config: str, given: dict[str, Any], start: str | None, time_scale: f
         flight = build_flight({**data, **given}, str(path))
     else:
         flight = build_flight({"name": path.stem, "vehicle": data, "trajectory": "", **given}, str(path))
+    given_for = {"--start": start, "--time-scale": time_scale}
+    idle = next((name for name, value in given_for.items() if value is not None and not flight.trajectory), None)
+    if idle is not None:
+        raise InputError(f"{idle}: there is no flight to predict, {path.name} is a vehicle file; add --trajectory")
     if start is not None:
         try:
             numbers = tuple(float(x) for x in start.split(","))

@@ -165,6 +165,12 @@ def test_certify_refuses_with_the_figure_and_still_prints_all_of_them(
     assert main(["certify", str(bad), "--allow-uncertified"]) == 2  # it exists for simulation only
 
 
+@pytest.mark.parametrize("option", [("--start", "1,2,-3"), ("--time-scale", "2")])
+def test_certify_of_a_vehicle_refuses_what_needs_a_trajectory(option: tuple[str, str], capsys) -> None:
+    assert main(["certify", "bundled", *option]) == 2
+    assert f"{option[0]}: there is no flight to predict, bundled.toml is a vehicle file" in capsys.readouterr().err
+
+
 def test_uncertified_gains_can_be_simulated_when_asked_for(
     tmp_path: Path, short: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
