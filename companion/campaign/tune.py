@@ -45,6 +45,8 @@ UNFIT: Final = 100.0
 """Cost of gains that no flight would be allowed with, and more the further off they are."""
 POPULATION: Final = 8
 """Candidates per gain and generation."""
+GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
+"""Steps of this share of a whole, round and round, lie evenly in it wherever they end."""
 STEP: Final = 1.25
 """By this factor each gain is changed in the end, to tell what stands in the way of more."""
 
@@ -144,16 +146,29 @@ def ranges(study: Study) -> list[tuple[float, float]]:
     return found
 
 
+def flight_at(study: Study, place: int) -> int:
+    """Which flight of a study the search takes in this place; in the first `study.total` places each one once.
+
+    The flights of one point of a grid stand together: taken in their order, a few would all be of its lowest values.
+    """
+    if not study.grid:
+        return place % study.total
+    stride = max(1, round(GOLDEN * study.total))
+    while math.gcd(stride, study.total) != 1:
+        stride += 1
+    return place * stride % study.total
+
+
 def over_what(output: str) -> str:
     """Which loop it is whose margins are judged, by the setpoints that close it."""
     return "attitude setpoints" if output == "attitude" else "body rates"
 
 
 def score(study_json: str, gains: Mapping[str, float], wish: Wish, first: int, engine: str) -> Score:
-    """Judge a gain set: the gates, then the flights from `first` on."""
+    """Judge a gain set: the gates, then the flights from the place `first` on, see `flight_at`."""
     study = from_json(study_json)
     changes = {f"controller.{name}": value for name, value in gains.items()}
-    flight = study.case_with(first, changes).flight
+    flight = study.case_with(flight_at(study, first), changes).flight
     vehicle, output = flight.vehicle, flight.output.by_law
     parameters = vehicle.parameters()
     found = certify(parameters.gains, parameters.model.drag)
@@ -182,10 +197,11 @@ def _flown(
     study: Study, changes: Mapping[str, float], wish: Wish, first: int, engine: str, least: float, margin_s: float
 ) -> Score:
     cost, rms, actuation, converged, lost = 0.0, [], [], 0, ""
-    for number in range(first, first + wish.flights):
-        case = study.case_with(number % study.total, changes)
+    for place in range(first, first + wish.flights):
+        number = flight_at(study, place)
+        case = study.case_with(number, changes)
         try:
-            outcome = measured(study, number % study.total, case, fly(case, engine), True)
+            outcome = measured(study, number, case, fly(case, engine), True)
         except (CompanionError, ArithmeticError, ValueError) as error:
             cost += LOST + math.log(study.file.diverged_m)
             lost = lost or " ".join(str(error).split())

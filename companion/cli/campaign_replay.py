@@ -114,7 +114,7 @@ def _say(row: dict[str, Any], same: bool | None, *, quiet: bool) -> None:
     from companion.campaign.outcome import MEASURES
 
     verdict = {None: "which the campaign has not flown yet", True: "the campaign's to the bit"}.get(
-        same, "NOT the campaign's: another version of the program or of numba flew it"
+        same, "NOT the campaign's: another engine, or another version of the program or of numba, flew it"
     )
     say(f"flight {row['flight']} (seed {row['seed']}), {verdict}", quiet=quiet)
     for name, value in row.items():

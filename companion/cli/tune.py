@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from companion.cli.common import EngineOption, JsonOption, VehicleOption, say
+
+if TYPE_CHECKING:
+    from companion.campaign.study import Study
+    from companion.campaign.tune import Tuned
 
 EXAMPLE = "Example: companion tune robustness --vehicle bundled --out gains.toml"
 
@@ -42,7 +46,10 @@ def run(
     from companion import accelerate
     from companion.campaign import tune as search
     from companion.campaign.study import load_study
+    from companion.errors import InputError
 
+    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):  # the search takes minutes
+        raise InputError(f"--out {out}: cannot be written: it is a folder, or in one that is not there")
     chosen = accelerate.resolve(engine)
     found = load_study(study, vehicle=vehicle)
     wish = search.Wish(margin_ms * 1e-3, flights, weight)
@@ -57,8 +64,6 @@ def run(
 
         tuned = search.tune(found, wish, chosen, generations=generations, workers=workers, progress=progress)
     sentences = search.words(tuned, wish)
-    if out is not None:
-        _write(out, tuned.gains, sentences)
     if as_json:
         document = {
             "vehicle": found.flight.vehicle.name,
@@ -73,14 +78,19 @@ def run(
             "words": sentences,
         }
         print(json.dumps(_finite(document), indent=2))
-        return
+    else:
+        _say(found, tuned, sentences)
+    if out is not None:  # what was found is told already, if this fails
+        _write(out, tuned.gains, sentences)
+        say(f"wrote {out}", quiet=as_json)
+
+
+def _say(found: Study, tuned: Tuned, sentences: list[str]) -> None:
     say(f"{found.flight.vehicle.name} in {found.name}: the best of {tuned.evaluations} gain sets")
     for name, value in tuned.gains.items():
         say(f"  {name:24s} {value:<8g} (before {tuned.before[name]:g})")
     for sentence in sentences:
         say(f"- {sentence}")
-    if out is not None:
-        say(f"wrote {out}")
 
 
 def _write(path: Path, gains: dict[str, float], sentences: list[str]) -> None:

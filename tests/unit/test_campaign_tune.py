@@ -6,6 +6,7 @@ import pytest
 
 from companion.campaign import tune
 from companion.campaign.study import load_study
+from companion.cli import main
 from companion.config import find
 from companion.control.certificate import certify, disturbance_overcome
 from companion.control.law import Gains
@@ -62,6 +63,13 @@ def test_the_margins_are_those_of_the_loop_that_flies(kind, loop, tmp_path, monk
         assert least.unfit.endswith("attitude setpoints, 10 ms are asked for")
 
 
+def test_actuator_controls_are_refused_before_the_search(tmp_path):
+    with pytest.raises(
+        InputError, match=r'the search for gains fly the law with output\.kind = "auto", "rates" or "att'
+    ):
+        over(tmp_path, "actuators")
+
+
 def test_a_bounded_error_that_does_not_hold_against_the_disturbance_is_not_flown(tmp_path, monkeypatch):
     monkeypatch.setattr(tune, "fly", lambda *_: pytest.fail("it was flown"))
     weak = OWN | {"position_error_max_m": 0.1}
@@ -75,6 +83,22 @@ def test_better_tracking_costs_less_and_a_lost_flight_more(tmp_path):
     assert (good.unfit, good.converged) == ("", 1) and 0.0 < good.rms_m < 0.2
     lost = tiny(tmp_path, duration_s=8.0, more="thrust_factor = { constant = 0.55 }\n").to_json()
     assert tune.score(lost, OWN, WISH, 0, "auto").cost > good.cost + tune.LOST
+
+
+def test_the_flights_of_the_search_are_from_all_over_the_grids(tmp_path):
+    """The first flights of a study with a grid are all of its first value."""
+    study = tiny(tmp_path, count=8, more="[vary.world]\nwind_m_s = { grid = [0.0, 4.0, 3] }\n")
+    winds = [study.values(tune.flight_at(study, place))["world.wind_m_s"] for place in range(6)]
+    assert sorted(winds) == [0.0, 0.0, 2.0, 2.0, 4.0, 4.0]
+    assert sorted(tune.flight_at(study, place) for place in range(24)) == list(range(24))
+    assert [tune.flight_at(tiny(tmp_path, count=8), place) for place in (0, 7, 8)] == [0, 7, 0]
+
+
+def test_where_gains_cannot_be_written_is_said_before_the_search(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tune, "tune", lambda *_, **__: pytest.fail("it was searched"))
+    for out in (tmp_path, tmp_path / "nowhere" / "gains.toml"):
+        assert main(["tune", str(tiny_file(tmp_path)), "--out", str(out)]) == 2
+        assert f"--out {out}: cannot be written" in capsys.readouterr().err
 
 
 def test_a_study_whose_flights_the_search_needs_all_is_refused_before_it(tmp_path, monkeypatch):
