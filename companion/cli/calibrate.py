@@ -49,9 +49,15 @@ TILT_MAX_RAD = 0.7
 HEIGHT_ROOM_M = 2.0
 STATE_AGE_MAX_S = 0.15
 START_M = (0.0, 0.0)
+OF_THE_FLIGHT = (
+    *("key", "system", "timeout", "out", "engine"),
+    *("height", "radius", "speed", "rate_step", "thrust_step", "repeats"),
+)
+"""Options that say how it is flown: they mean nothing for a flight that is there."""
 
 
 def run(
+    context: typer.Context,
     mass: Annotated[float, typer.Option("--mass", metavar="KG", help="Take-off mass, known to 10 %.")],
     vehicle: Annotated[
         str, typer.Option("--vehicle", metavar="NAME", help="Vehicle file to begin with: gains, limits, geometry.")
@@ -109,6 +115,8 @@ def run(
         raise InputError(f"--timeout {timeout:g}: must be a number of seconds above 0")
     if sum((sim, connect is not None, from_flight is not None)) > 1:
         raise InputError("--sim, --connect and --from-flight say where the flight comes from: leave all but one out")
+    if from_flight is not None:
+        _refuse_idle(context)
     if faults is not None and not sim:
         raise InputError(f"--faults {faults}: only for the bundled vehicle; add --sim")
     if save is not None:
@@ -138,6 +146,16 @@ def run(
         say(f"{flown.sentence}; flight folder {flown.folder}", quiet=as_json)
         folder = flown.folder
     _identify(folder, vehicle, entered, save, as_json=as_json)
+
+
+def _refuse_idle(context: typer.Context) -> None:
+    """Raise InputError where an option of the flight is given, and none is flown."""
+    from companion.errors import InputError
+
+    sources = ((name, context.get_parameter_source(name)) for name in OF_THE_FLIGHT)
+    given = [f"--{name.replace('_', '-')}" for name, source in sources if source and source.name == "COMMANDLINE"]
+    if given:
+        raise InputError(f"{', '.join(given)}: with --from-flight nothing is flown; leave out what says how")
 
 
 def configured(

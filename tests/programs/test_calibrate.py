@@ -100,6 +100,11 @@ def test_an_interruption_ends_in_hold(tmp_path) -> None:
         (["--mass", "1", "--thrust-step", "0.9"], ExitCode.BAD_INPUT, "thrust_step = 0.9"),
         (["--mass", "1", "--vehicle", "nobody"], ExitCode.BAD_INPUT, "no vehicle file 'nobody'"),
         (["--mass", "1", "--from-flight", "nowhere"], ExitCode.BAD_INPUT, "nowhere"),
+        (
+            ["--mass", "1", "--from-flight", "x", "--rate-step", "1", "--out", "y"],
+            ExitCode.BAD_INPUT,
+            "--out, --rate-step:",
+        ),
         (["--mass", "1", "--sim", "--save", "nowhere/x.toml"], ExitCode.BAD_INPUT, "there is no folder nowhere"),
     ],
 )
