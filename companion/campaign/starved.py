@@ -121,7 +121,7 @@ def fly_starved(
         start=(position, yaw),
         px4="1.18",
     )
-    course = Course(trajectory, vehicle, position, yaw, (0.0, 0.0, 0.0))
+    course = Course(trajectory, vehicle, position, yaw, (0.0, 0.0, 0.0), flight.height_min_m)
     tracker = Tracker(vehicle, flight.output.sends, compiled)
     tracker.begin(State(position, (0.0, 0.0, 0.0), quat_from_yaw(yaw), (0.0, 0.0, 0.0)))
     guards = Guards(vehicle, tracker.parameters)
