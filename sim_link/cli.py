@@ -43,6 +43,8 @@ from .wind import World
 
 FAULTS_SUFFIX = ".faults.csv"
 """In the place of the truth file's own."""
+STATE_RATE_MIN_HZ = 1.0
+"""Between two states nobody is heard, and no Ctrl-C either."""
 _SITL_SECOND_RANGE = 10
 """From this instance on PX4's ports would run into one another; ours go on 10000 higher."""
 
@@ -90,7 +92,7 @@ def run(
     ] = None,
     px4: Annotated[str, typer.Option(help="Whose behaviour: 1.18 or 1.13.")] = "1.18",
     lockstep: Annotated[bool, typer.Option("--lockstep", help="The clock waits for the companion.")] = False,
-    speed: Annotated[float, typer.Option(help="Vehicle time per wall time, without --lockstep.")] = 1.0,
+    speed: Annotated[float, typer.Option(help="Vehicle time per wall time; not with --lockstep.")] = 1.0,
     truth: Annotated[Path | None, typer.Option(metavar="FILE", help="Write what really happens as CSV.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="End after this vehicle time [s].")] = None,
     engine: Annotated[str, typer.Option(help="auto, python or numba.")] = "auto",
@@ -133,6 +135,11 @@ def run(
     """
     stop = Stop(with_parent)
     try:
+        _refuse_what_would_do_nothing(
+            ground=ground_port is not None and not ground,
+            truth=truth_port is not None and not truth_stream,
+            speed=speed != 1.0 and lockstep,
+        )
         file = _vehicle_file(vehicle, state_rate, state_age)
         secret, signing_time = (None, 0) if key is None else load_key(key)
         world = World(
@@ -284,11 +291,28 @@ def _warm_up(options: VehicleOptions) -> None:
     trial.tick()
 
 
+def _refuse_what_would_do_nothing(*, ground: bool, truth: bool, speed: bool) -> None:
+    """Say which option another one leaves without effect.
+
+    Raises:
+        InputError: there is one.
+    """
+    for given, option, other in (
+        (ground, "--ground-port", "--no-ground"),
+        (truth, "--truth-port", "--no-truth-stream"),
+        (speed, "--speed", "--lockstep"),
+    ):
+        if given:
+            raise InputError(f"{option} does nothing with {other}: leave one of them out")
+
+
 def _vehicle_file(name: str, state_rate_hz: float | None, state_age_s: float | None) -> VehicleFile:
     """Load the vehicle file, with what the command line replaces."""
     file = load(name)
     if state_rate_hz is not None:
         file = replace(file, state_rate_hz=number(state_rate_hz, "--state-rate", above=0.0))
+        if state_rate_hz < STATE_RATE_MIN_HZ:
+            raise InputError(f"--state-rate {state_rate_hz:g}: at least {STATE_RATE_MIN_HZ:g} Hz")
     if state_age_s is not None:
         file = replace(file, state_age_s=number(state_age_s, "--state-age"))
         if state_age_s > 1.0:
