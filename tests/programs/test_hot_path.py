@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).parent
+CASES = Path(__file__).parents[1] / "loopback"
 FLY = """
 import gc, json, sys, tracemalloc
 from pathlib import Path
@@ -84,7 +84,7 @@ ENGINES = [
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_nothing_is_compiled_collected_or_kept(engine, tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(HERE)}
+    environment = {**os.environ, "PYTHONPATH": str(CASES)}
     command = [sys.executable, "-c", FLY, str(tmp_path), engine]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=100, check=False)
     assert done.returncode == 0, done.stderr
