@@ -131,7 +131,7 @@ class Stand:
         path.write_text(tomlkit.dumps(_lists(flight.vehicle.model_dump(exclude_none=True))))
         acts = flight.world
         world = World(acts.force_n, acts.gravity_factor, acts.wind_m_s, acts.turbulence, seed=1)
-        options.setdefault("engine", "python")
+        options.setdefault("engine", "auto")
         self.vehicle = Vehicle(VehicleOptions(vehicle=load(str(path)), world=world, start=start, **options))
         self.port = free_udp_port()
         self.peer = Peer(

@@ -232,7 +232,7 @@ class Flight:
 
     def __init__(self, *, file: VehicleFile | None = None, parameters=None, ground: bool = False, **options) -> None:
         self.sock = free_socket()
-        options.setdefault("engine", "python")
+        options.setdefault("engine", "auto")
         self.vehicle = Vehicle(VehicleOptions(vehicle=file or vehicle_file(), parameters=parameters or {}, **options))
         self._stopping = False
         self.ground_sock = free_socket() if ground else None
