@@ -1,5 +1,6 @@
 """Times across restarts: ended in order, killed, damaged, several at once."""
 
+import fcntl
 import json
 import os
 import signal
@@ -68,6 +69,20 @@ def test_in_order_nothing_ahead_counts_as_used(tmp_path):
     for _ in range(20):
         with opened(tmp_path) as signer:
             assert sent_at(signer) < time_now() + UNITS_PER_S
+
+
+def test_who_only_looks_is_not_taken_for_a_process_that_lives(tmp_path):
+    first, killed = Place(tmp_path), Place(tmp_path)
+    reserved = time_now() + RESERVE
+    killed.store(SigningTimes(newest=0, streams={}), time_now(), reserved, ended=False)
+    killed.release()
+    first.release()
+    with killed.path.with_suffix(".lock").open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)  # another process looks at the same moment
+        place = Place(tmp_path)
+        assert place.path == first.path
+        assert place.load().floor == reserved  # of what came before the other was killed nothing is known
+    place.release()
 
 
 KILLED = """
