@@ -49,7 +49,7 @@ test-programs: $(VENV)/.test  ## Run what starts whole programs: installed, serv
 test-long: $(VENV)/.test  ## Run the tests that take their time: whole campaigns, fault matrices, real time
 	$(PY) -m pytest -n 2 --dist loadfile -m long
 
-test-plain: $(VENV)/.test  ## Run both as they run where numba is not installed
+test-plain: $(VENV)/.test  ## Run test and test-programs as they run where numba is not installed
 	COMPANION_TEST_WITHOUT_NUMBA=1 $(PY) -m pytest -n 2 --dist loadfile -m "not long"
 
 coverage: $(VENV)/.test  ## Run the tests as plain Python and say how many branches they reach; the programs they start count

@@ -166,18 +166,23 @@ def check_vehicle(case: Case, sim: VehicleFile) -> Clock:
     return clock_of(case, sim)
 
 
-def clock_of(case: Case, sim: VehicleFile) -> Clock:
-    """The clockwork of a case; its number of states is not known yet. Raises InputError."""
-    dt_us = round(1.0e6 / sim.loop_rate_hz)
+def steps_per_state(sim: VehicleFile) -> int:
+    """Loop steps between two states. Raises InputError where no state would come at its time."""
     per_state = sim.loop_rate_hz / sim.state_rate_hz
     if abs(per_state - round(per_state)) > 1e-9 * per_state:
         raise InputError(
             f"vehicle {sim.name!r}: autopilot.loop_rate_hz = {sim.loop_rate_hz:g} must be a whole multiple of"
             f" link.state_rate_hz = {sim.state_rate_hz:g}"
         )
+    return round(per_state)
+
+
+def clock_of(case: Case, sim: VehicleFile) -> Clock:
+    """The clockwork of a case; its number of states is not known yet. Raises InputError."""
+    dt_us, per_state = round(1.0e6 / sim.loop_rate_hz), steps_per_state(sim)
     delay = -(-round(sim.command_delay_s * 1e6) // dt_us)
     gust = steps_per_gust(dt_us) if case.flight.world.turbulence > 0.0 else 1 << 40
-    return Clock(START_US, dt_us, round(per_state), age_steps(sim, dt_us), delay, gust, 0)
+    return Clock(START_US, dt_us, per_state, age_steps(sim, dt_us), delay, gust, 0)
 
 
 def memory_of(vehicle: Vehicle, clock: Clock) -> tuple[Memory, FloatArray]:

@@ -27,7 +27,7 @@ from companion.cli.common import (
 
 if TYPE_CHECKING:
     from companion.campaign.simulate import Trace
-    from companion.config import Flight, Vehicle
+    from companion.config import Flight
 
 EXAMPLE = "Example: companion simulate paper --ideal --csv paper.csv"
 
@@ -54,6 +54,7 @@ def run(
     from rich.progress import Progress
 
     from companion.campaign.simulate import fly_ideal, fly_sampled, write_csv
+    from companion.campaign.whole import simulated, steps_per_state
     from companion.config import load_flight
     from companion.errors import ExitCode, InputError
     from companion.flight.preflight import gate_gains, gate_reference
@@ -69,7 +70,7 @@ def run(
             " alone: fly it with `companion demo`"
         )
     if not ideal:
-        _check_rates(configured.vehicle)
+        steps_per_state(simulated(configured.vehicle))  # rounded, it would be another vehicle
     elif configured.world.turbulence > 0.0:
         say("the ideal setting has no gusts: the mean wind alone blows", quiet=as_json)
     path = of_flight(configured)
@@ -95,19 +96,6 @@ def run(
         _print(configured, path.name, trace, csv, ideal=ideal)
     if missed:
         raise typer.Exit(int(ExitCode.MISSED))
-
-
-def _check_rates(vehicle: Vehicle) -> None:
-    """Raise InputError where no state would come at its time: what is simulated would be another vehicle."""
-    from companion.errors import InputError
-
-    loop_hz, states_hz = vehicle.autopilot.loop_rate_hz, vehicle.link.state_rate_hz
-    steps = loop_hz / states_hz
-    if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
-        raise InputError(
-            f"vehicle {vehicle.name!r}: autopilot.loop_rate_hz = {loop_hz:g} must be a whole multiple of"
-            f" link.state_rate_hz = {states_hz:g}"
-        )
 
 
 def _print(configured: Flight, name: str, trace: Trace, csv: Path | None, *, ideal: bool) -> None:

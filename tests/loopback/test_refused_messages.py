@@ -5,11 +5,6 @@ The same with 100,000: `python tools/signing.py`.
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
 from signing import costs, refused
 
 from companion.link.signing import Signer

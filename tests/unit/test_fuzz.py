@@ -6,16 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import fuzz
+import fuzz_targets
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 TOOLS = Path(__file__).parents[2] / "tools"
-sys.path.insert(0, str(TOOLS))
-
-import fuzz  # noqa: E402
-import fuzz_targets  # noqa: E402
-
 NAMES = sorted(fuzz_targets.TARGETS)
 _made: dict[str, fuzz_targets.Target] = {}
 
