@@ -30,7 +30,7 @@ from pymavlink.dialects.v20 import common as mavlink2
 from companion import accelerate
 from companion.config import load_flight
 from companion.control.types import State
-from companion.flight.course import Course
+from companion.flight.course import Course, Timed
 from companion.flight.tracker import Tracker, kernels
 from companion.ground.exchange import OWN_COMPONENT, OWN_SYSTEM
 from companion.ground.ftp import crc32
@@ -152,13 +152,14 @@ def steps() -> Iterator[Row]:
     """The control step: the law with its prediction, and the whole step with reference and conversion around it."""
     vehicle = load_flight("paper").vehicle
     course = Course(load("paper"), vehicle, (0.0, 0.0, -10.0), 0.0, None)
+    reference_at = Timed(course, 0.0)
     state = State((0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1))
     for engine, reach in (("python", 40), ("numba", 5)):
         if engine == "numba" and not accelerate.available():
             continue
         tracker = Tracker(vehicle, "rates", kernels(engine))
         tracker.begin(state)
-        whole = median_us(lambda i, t=tracker: t.step(1.0 + 0.004 * i, state, course.at))  # type: ignore[misc]
+        whole = median_us(lambda i, t=tracker: t.step(1.0 + 0.004 * i, state, reference_at))  # type: ignore[misc]
         reference, pieces = course.at(1.0), tracker._prediction.pieces(1.0 + 0.004 * 4300)
         arithmetic = tracker._engine
 

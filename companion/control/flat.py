@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import MutableSequence, Sequence
 
 from companion.control.heading import HeadingState
+from companion.control.history import PIECE
 from companion.control.law import (
     Command,
     ControllerState,
@@ -24,12 +25,21 @@ from companion.control.law import (
 from companion.control.model import Factors, advance
 from companion.control.types import Reference, State
 
-PIECE = 5
-"""Numbers of a piece of the prediction: thrust setpoint, three rates, duration."""
-INPUTS = 36
-"""Input numbers before the controller's state."""
-CONTROLLER = INPUTS
-"""Where the controller's state stands in the input; the step replaces it."""
+# where things stand in the input, behind the state's 13 numbers
+DT = 13
+"""Since the last step [s]."""
+FROZEN = 14
+"""1: hold the estimator still."""
+INTEGRATE = 15
+"""1: the controller's state goes on."""
+THRUST_NOW = 16
+"""That acts at the state's stamp [N]."""
+COUNT = 17
+"""Of the pieces."""
+REFERENCE = 18
+"""18 numbers: position with four derivatives, heading with two."""
+CONTROLLER = REFERENCE + 18
+"""The controller's state; the step replaces it."""
 PIECES = CONTROLLER + 15
 """Where the pieces begin."""
 CONSTANTS = 36
@@ -79,22 +89,21 @@ def control_step(x: MutableSequence[float], c: Sequence[float], y: MutableSequen
     """Predicts the state through the pieces, computes one law step, and replaces the controller's state.
 
     Args:
-        x: state 13, reference 18, thrust at the stamp, dt, frozen (0 or 1), number of pieces, whether to integrate (0
-        or 1), then the
-            controller's state 15 (T, T', b_hat, r2d, forward, held, lead integral), then PIECE numbers per piece.
+        x: state 13, then what DT to CONTROLLER name, the controller's state being 15 numbers (T, T', b_hat, r2d,
+            forward, held, lead integral), then PIECE numbers per piece.
         c: `constants`.
         y: gets RESULTS numbers, see the names above.
     """
     state = State((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8], x[9]), (x[10], x[11], x[12]))
     ref = Reference(
-        (x[13], x[14], x[15]),
-        (x[16], x[17], x[18]),
-        (x[19], x[20], x[21]),
-        (x[22], x[23], x[24]),
-        (x[25], x[26], x[27]),
-        x[28],
-        x[29],
-        x[30],
+        (x[18], x[19], x[20]),
+        (x[21], x[22], x[23]),
+        (x[24], x[25], x[26]),
+        (x[27], x[28], x[29]),
+        (x[30], x[31], x[32]),
+        x[33],
+        x[34],
+        x[35],
     )
     b_hat = (x[38], x[39], x[40])
     memory = HeadingState((x[41], x[42], x[43]), (x[44], x[45], x[46]), x[47] > 0.5)
@@ -103,13 +112,13 @@ def control_step(x: MutableSequence[float], c: Sequence[float], y: MutableSequen
     model = Model(c[10], c[11], c[12], (c[13], c[14], c[15]), (c[16], c[17], c[18]), c[19])
     limits = Limits(c[20], c[21], (c[22], c[23], c[24]), c[25], c[26], c[27])
     lags = (c[28], c[29], c[30], c[31], c[32], c[33], c[34], c[35])
-    thrust = x[31]
-    for i in range(int(x[34])):
+    thrust = x[THRUST_NOW]
+    for i in range(int(x[COUNT])):
         j = PIECES + PIECE * i
         rates = (x[j + 1], x[j + 2], x[j + 3])
         state, thrust = advance(state, thrust, rates, x[j], b_hat, (c[10], c[11], c[12]), lags, x[j + 4])
-    command, after, out = step(state, ref, controller, Parameters(gains, model, limits), x[33] > 0.5, x[32])
-    if x[35] < 0.5:
+    command, after, out = step(state, ref, controller, Parameters(gains, model, limits), x[FROZEN] > 0.5, x[DT])
+    if x[INTEGRATE] < 0.5:
         after = controller
     e = out.errors
     y[0] = command.thrust

@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 from companion.config import Flight
 from companion.control import flat
-from companion.control.types import Quat, Reference, Vec3
+from companion.control.types import Quat, Vec3
 from companion.flight.clock import VehicleClock
 from companion.flight.course import Course
 from companion.flight.guards import Finding
 from companion.flight.phases import Autopilot, Phase
 from companion.flight.rows import StepTiming, control_row
-from companion.flight.tracker import TrackerStep
+from companion.flight.tracker import Target, TrackerStep
 from companion.flight.watch import Seen, Watch
 from companion.link.telemetry import VehicleState
 from companion.link.timesync import PacedPeer
@@ -73,8 +73,8 @@ class FlownStep(NamedTuple):
 class Measured(NamedTuple):
     """What is worked out of a step once, for its row, its judgement and the display."""
 
-    reference: Reference
-    """At the state's stamp."""
+    target: Target
+    """The reference at the state's stamp."""
     error: Vec3
     """Position less reference, NED [m]."""
     timing: StepTiming
@@ -120,8 +120,11 @@ class Accounting:
             asked_ns: the vehicle's time when it asked for our answer in lockstep [ns]; None elsewhere.
         """
         state, arrival_ns, took_ns = step.state, step.arrival_ns, sent_ns - step.arrival_ns
-        reference = step.course.at(step.course_s)
-        p, d = state.p, reference.p
+        target = step.out.target
+        if target is None:
+            reference = step.course.at(step.course_s)
+            target = Target(reference.p, reference.v)
+        p, d = state.p, target.p
         age_s: float | None
         if asked_ns is not None:
             age_ns = asked_ns - state.t_vehicle_us * 1000
@@ -130,7 +133,7 @@ class Accounting:
             age_s = self._watch.age_s(state.t_vehicle_us, arrival_ns)
             sent_age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
         timing = StepTiming(sent_age_ms, took_ns * 1e-3, took_ns > self._late_ns, step.skipped)
-        return Measured(reference, (p[0] - d[0], p[1] - d[1], p[2] - d[2]), timing, age_s)
+        return Measured(target, (p[0] - d[0], p[1] - d[1], p[2] - d[2]), timing, age_s)
 
     def settle(self, step: FlownStep, measured: Measured, state_s: float) -> Finding | None:
         """Records and judges a step; what is to be done about it.
@@ -140,9 +143,9 @@ class Accounting:
             measured: how it went.
             state_s: vehicle time at the arrival of its state [s].
         """
-        reference, error, timing, age_s = measured
+        target, error, timing, age_s = measured
         shown_s = step.track_s if step.phase is Phase.TRACK else math.nan
-        self._record.append(control_row(shown_s, step.phase, step.state, reference, error, step.out, timing))
+        self._record.append(control_row(shown_s, step.phase, step.state, target, error, step.out, timing))
         paced = self._peer.paced
         seen = Seen(step.state, error, step.out, step.skipped, timing.late, age_s, step.arrival_ns, paced)
         return self._watch.on_step(seen, step.course, state_s)
@@ -169,7 +172,7 @@ class Accounting:
             disturbance_m_s2=(north, east, down),
             position_m=state.p,
             attitude=state.q,
-            reference_m=measured.reference.p,
+            reference_m=measured.target.p,
             thrust_n=n[flat.TOTAL],
             state_age_ms=measured.timing.age_ms,
             battery=self._autopilot.battery,

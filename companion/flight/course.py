@@ -9,12 +9,16 @@ from dataclasses import replace
 from enum import Enum
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.config import Vehicle
 from companion.control.types import Reference, Vec3
 from companion.errors import RefusedError
 from companion.flight.clearance import Clearance
 from companion.flight.tempo import Ramp, RampPlan, Tempo
 from companion.trajectory.anchored import Anchored, Trajectory, anchored
+from companion.trajectory.curve import MOVED, curve_of
 from companion.trajectory.flatness import PointMass, ReferenceLimits, demand
 from companion.trajectory.joins import SHARE, Join, join, stop
 from companion.trajectory.pieces import Piece, chain
@@ -141,6 +145,9 @@ class Course:
         self.track_s = path.duration_s
         self.stop_s = stopping.duration_s
         self._chain = chain([*pieces, path, stopping])
+        numbers = curve_of(path)
+        self.curve = None if numbers is None else np.array(numbers)
+        """The trajectory as numbers (`trajectory.curve`); None: it has none."""
         self._tempo = Tempo()
         self.moved_m: Vec3 = ZERO
         """By how much it was moved since it was planned, NED: its hold point, path, home and origin do not show it."""
@@ -189,6 +196,13 @@ class Course:
         """Moves all of it (NED): after the autopilot's estimate has jumped by as much."""
         (x, y, z), (dx, dy, dz) = self.moved_m, by_m
         self.moved_m = (x + dx, y + dy, z + dz)
+        if self.curve is not None:
+            self.curve[MOVED : MOVED + 3] = self.moved_m
+
+    @property
+    def steady(self) -> bool:
+        """Whether it has had its own pace from the beginning."""
+        return self._tempo.steady
 
     def _at_own_pace(self, course_s: float) -> Reference:
         on_track_s = course_s - self.join_s
@@ -232,6 +246,29 @@ class Course:
     def change_pace(self, ramp: Ramp) -> None:
         """Takes a change of pace that was planned, or recorded."""
         self._tempo.add(ramp)
+
+
+class Timed:
+    """A course on the vehicle's clock: the reference as a function of vehicle time.
+
+    Args:
+        course: that is flown.
+        begin_s: vehicle time at which it was engaged [s].
+    """
+
+    def __init__(self, course: Course, begin_s: float) -> None:
+        self.course, self.begin_s, self.join_s = course, begin_s, course.join_s
+
+    def __call__(self, t_s: float) -> Reference:
+        """The reference at a vehicle time [s]."""
+        return self.course.at(t_s - self.begin_s)
+
+    def curve(self, stamp_s: float, delay_s: float) -> NDArray[np.float64] | None:
+        """The curve that gives the reference at a stamp and a delay later [s], where one does; else None."""
+        course = self.course
+        if course.curve is None or not course.steady or stamp_s - self.begin_s - self.join_s < 0.0:
+            return None
+        return course.curve if stamp_s + delay_s - self.begin_s - self.join_s <= course.track_s else None
 
 
 class _OwnPace:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from companion.config import Flight
+from companion.control.history import Attitude
 from companion.control.output import PositionSetpoint, Setpoint
 from companion.control.types import State
 from companion.errors import LinkError
@@ -27,12 +28,11 @@ from companion.flight.clock import VehicleClock
 from companion.flight.coast import coast_setpoint
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
 from companion.flight.controller import controller_of
-from companion.flight.course import at_rest
+from companion.flight.course import Course, Timed, at_rest
 from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
 from companion.flight.measure import silence_limit_s
 from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
-from companion.flight.prediction import Attitude
 from companion.flight.preflight import Preflight
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report, vehicle_facts
 from companion.flight.responses import respond
@@ -157,6 +157,7 @@ class FlightLoop:
         self._sent_us: int | None = None
         """Stamp of the last state that a setpoint went out for."""
         self._coasted = False
+        self._timed: Timed | None = None
         self._unaccounted: FlownStep | None = None
         self._engagement: Engagement | None = None
         self._delays_told = 0
@@ -588,7 +589,7 @@ class FlightLoop:
         assert sequence.course is not None
         course, begin_s = sequence.course, sequence.engaged_at_s
         stamp_s = state.t_vehicle_us * 1e-6
-        out = self._tracker.step(stamp_s, State(state.p, state.v, state.q, state.w), lambda t: course.at(t - begin_s))
+        out = self._tracker.step(stamp_s, State(state.p, state.v, state.q, state.w), self._reference(course, begin_s))
         if not self._send(out.setpoint, state):
             self._lost += 1
             return
@@ -597,6 +598,13 @@ class FlightLoop:
         self._unaccounted = FlownStep(
             state, out, course, stamp_s - begin_s, sequence.phase, track_s, skipped, arrival_ns
         )
+
+    def _reference(self, course: Course, begin_s: float) -> Timed:
+        """The course on the vehicle's clock; the same as long as neither changes."""
+        timed = self._timed
+        if timed is None or timed.course is not course or timed.begin_s != begin_s:
+            timed = self._timed = Timed(course, begin_s)
+        return timed
 
     def _account(self) -> None:
         """Records and judges the last step: after its setpoint is out, and while a vehicle in lockstep moves on."""

@@ -10,7 +10,7 @@ what they ask of the yaw axis is mixed (`Turning`); the other axes know nothing 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -21,7 +21,6 @@ from companion.control.law import ControllerState, Gains, Limits, Model, Paramet
 from companion.control.model import Factors
 from companion.control.types import Reference, State
 from companion.errors import InputError
-from companion.flight.prediction import Piece
 
 if TYPE_CHECKING:
     from companion.flight.tracker import Engine, Numbers, Tracker
@@ -219,7 +218,7 @@ class Turning:
         state: State,
         reference: Reference,
         thrust: float,
-        pieces: list[Piece],
+        pieces: Sequence[float],
         frozen: bool,
         integrate: bool,
         dt_s: float,

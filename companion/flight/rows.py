@@ -8,7 +8,7 @@ from companion.control import flat
 from companion.control.output import thrust_of
 from companion.control.types import Reference, Vec3
 from companion.flight.phases import PHASE_INDEX, Phase
-from companion.flight.tracker import TrackerStep
+from companion.flight.tracker import Target, TrackerStep
 from companion.link.telemetry import VehicleState
 
 
@@ -25,7 +25,7 @@ def control_row(
     track_s: float,
     phase: Phase,
     state: VehicleState,
-    reference: Reference,
+    target: Target | Reference,
     error: Vec3,
     out: TrackerStep,
     timing: StepTiming,
@@ -36,7 +36,7 @@ def control_row(
         track_s: time on the trajectory [s], NaN outside of the track phase.
         phase: the phase of the step.
         state: as received.
-        reference: at the state's stamp.
+        target: the reference at the state's stamp.
         error: position less reference, NED [m].
         out: what the step gave.
         timing: how it went.
@@ -44,7 +44,7 @@ def control_row(
     n = out.numbers
     return (
         (state.t_vehicle_us * 1e-6, track_s, PHASE_INDEX[phase], *state.p, *state.v, *state.q, *state.w)
-        + (*reference.p, *reference.v, *error, n[flat.HEADING_ERROR], *n[flat.ERRORS], n[flat.LYAPUNOV])
+        + (*target.p, *target.v, *error, n[flat.HEADING_ERROR], *n[flat.ERRORS], n[flat.LYAPUNOV])
         + (*n[flat.B_HAT], n[flat.TOTAL], n[flat.TOTAL_RATE], *n[flat.TAU], *n[flat.RATES])
         + (thrust_of(out.setpoint), timing.age_ms, timing.took_us, float(timing.late), float(timing.skipped))
         + (n[flat.LIMITS], *n[flat.PREDICTED_Q], *n[flat.PREDICTED_W])

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from companion import accelerate
 from companion.config import Vehicle
-from companion.control import flat
+from companion.control import flat, history
 from companion.control.heading import HeadingState
+from companion.control.history import PIECE, Attitude, refreshed
 from companion.control.law import (
     LIMIT_THRUST_MAX,
     LIMIT_THRUST_MIN,
@@ -25,21 +26,59 @@ from companion.control.law import (
     step,
 )
 from companion.control.model import Factors, advance, factors
-from companion.control.output import Conversion, Setpoint, actuator_output, attitude_output, lead, rates_output
+from companion.control.output import (
+    Conversion,
+    RateSetpoint,
+    Setpoint,
+    actuator_output,
+    attitude_output,
+    lead,
+    rates_output,
+)
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.control.vectors import add, axes, norm
 from companion.control.vectors import scale as scale_vector
-from companion.flight.prediction import Attitude, Piece, Prediction, refreshed
+from companion.flight import fused
+from companion.flight.course import Timed
+from companion.flight.prediction import Prediction
 from companion.flight.resets import Reset, about_vertical
 from companion.flight.retuning import Transition, Turning, between
 from companion.flight.thrust_scale import ThrustScale
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
-PIECES_MAX = 128
-"""Of 10 ms each, with some room beyond the longest delay that a vehicle file may have and what is followed above it."""
+_GIVEN = (0.0,) * fused.INPUT
+"""Neither on a curve nor with a history."""
+_RESULTS, _REST, _REFERENCE = 8 * fused.RESULTS, 8 * fused.SHARE, 8 * (fused.INPUT + flat.REFERENCE)
+"""Where results and the reference stand, in bytes."""
 THRUST_LIMITS = LIMIT_THRUST_MIN | LIMIT_THRUST_MAX
 ReferenceAt = Callable[[float], Reference]
 Numbers = tuple[float, ...]
+
+
+class Target(NamedTuple):
+    """Where the reference is at an instant."""
+
+    p: Vec3
+    """Position, NED [m]."""
+    v: Vec3
+    """Velocity, NED [m/s]."""
+
+
+class WholeStep(NamedTuple):
+    """What a control step starts from."""
+
+    stamp_s: float
+    """Vehicle time of the state [s]."""
+    state: State
+    """As received."""
+    delay_s: float
+    """From the stamp to the effect of the command [s]."""
+    frozen: bool
+    """Hold the estimator still."""
+    integrate: bool
+    """Whether the controller's state goes on."""
+    dt_s: float
+    """Since the last step [s]."""
 
 
 class Engine(Protocol):
@@ -67,7 +106,7 @@ class Engine(Protocol):
         state: State,
         reference: Reference,
         thrust: float,
-        pieces: list[Piece],
+        pieces: Sequence[float],
         frozen: bool,
         integrate: bool,
         dt_s: float,
@@ -78,7 +117,7 @@ class Engine(Protocol):
             state: as received.
             reference: at the time of effect.
             thrust: that acts at the state's stamp [N].
-            pieces: what acts from the stamp to the time of effect.
+            pieces: what acts from the stamp to the time of effect, `history.PIECE` numbers each.
             frozen: hold the estimator still.
             integrate: whether the controller's state goes on.
             dt_s: since the last step [s].
@@ -132,7 +171,7 @@ class PlainEngine:
         state: State,
         reference: Reference,
         thrust: float,
-        pieces: list[Piece],
+        pieces: Sequence[float],
         frozen: bool,
         integrate: bool,
         dt_s: float,
@@ -140,9 +179,10 @@ class PlainEngine:
         """One step (see Engine)."""
         controller = self._controller
         assert controller is not None
-        for setpoint, rates, duration_s in pieces:
+        for i in range(0, len(pieces), PIECE):
+            setpoint, x, y, z, duration_s = pieces[i : i + PIECE]
             state, thrust = advance(
-                state, thrust, rates, setpoint, controller.b_hat, self._vehicle, self._lags, duration_s
+                state, thrust, (x, y, z), setpoint, controller.b_hat, self._vehicle, self._lags, duration_s
             )
         command, after, out = step(state, reference, controller, self._parameters, frozen, dt_s)
         if integrate:
@@ -153,21 +193,24 @@ class PlainEngine:
 
 
 class CompiledEngine:
-    """The control step compiled as one kernel over arrays that are allocated once."""
+    """The control step compiled as one kernel over arrays that are allocated once (`flight.fused`)."""
 
     def __init__(self, parameters: Parameters, lags: Factors) -> None:
         import numpy as np
 
-        self._kernel: Any = accelerate.compile_kernel(flat.control_step)
-        self._x = np.zeros(flat.PIECES + flat.PIECE * PIECES_MAX)
-        self._y = np.zeros(flat.RESULTS)
+        self._kernel: Any = accelerate.compile_kernel(fused.flight_step)
+        self._m = m = np.zeros(fused.SIZE)
+        self._x = m[fused.INPUT : fused.CONSTANTS]
+        self._c = m[fused.CONSTANTS : fused.CONVERSION]
+        self._no_curve = np.zeros(fused.NO_CURVE)
+        self._no_history = np.zeros(history.CAPACITY)
         self._lags = lags
-        self._c = np.array(flat.constants(parameters, lags))
-        self._bytes = self._x.data.cast("B")
-        self._result = self._y.data.cast("B")
-        self._pack = struct.Struct(f"{flat.INPUTS}d").pack_into
-        self._pack_piece = struct.Struct(f"{flat.PIECE}d").pack_into
+        self.retune(parameters)
+        self._bytes = m.data.cast("B")
+        self._pack = struct.Struct(f"{fused.INPUT + flat.THRUST_NOW}d").pack_into
+        self._pack_reference = struct.Struct("18d").pack_into
         self._unpack = struct.Struct(f"{flat.RESULTS}d").unpack_from
+        self._unpack_rest = struct.Struct(f"{fused.SIZE - fused.SHARE}d").unpack_from
 
     def begin(self, controller: ControllerState) -> None:
         """Takes a new controller state."""
@@ -187,28 +230,66 @@ class CompiledEngine:
         self._lags = lags
         self._c[-len(lags) :] = lags
 
+    def convert(self, thrust_full_n: float, curve_factor: float) -> None:
+        """Turns thrust into commands so from now on (`output.Conversion`)."""
+        self._m[fused.CONVERSION : fused.LAGS] = thrust_full_n, curve_factor
+
+    def predict(self, lags_s: Vec3, delay_s: float) -> None:
+        """Predicts over this delay [s] from now on; lags of roll, pitch and yaw rate behind their setpoints [s]."""
+        self._m[fused.LAGS : fused.ATTITUDE] = *lags_s, delay_s
+
     def step(
         self,
         state: State,
         reference: Reference,
         thrust: float,
-        pieces: list[Piece],
+        pieces: Sequence[float],
         frozen: bool,
         integrate: bool,
         dt_s: float,
     ) -> Numbers:
         """One step (see Engine)."""
+        x = self._x
+        self._pack(self._bytes, 0, *_GIVEN, *state.p, *state.v, *state.q, *state.w, dt_s, frozen, integrate)
+        self._give(reference)
+        x[flat.THRUST_NOW], x[flat.COUNT] = thrust, len(pieces) / PIECE
+        x[flat.PIECES : flat.PIECES + len(pieces)] = pieces
+        self._kernel(self._m, self._no_history, self._no_curve)
+        return self._unpack(self._bytes, _RESULTS)
+
+    def fly(
+        self, step: WholeStep, prediction: Prediction, reference_at: ReferenceAt, attitude: Attitude | None
+    ) -> tuple[Numbers, tuple[float, ...], bool]:
+        """One step with its history and its reference.
+
+        Args:
+            step: what the tracker has decided.
+            prediction: gives commands and gets this one.
+            reference_at: the reference as a function of vehicle time [s].
+            attitude: newer than the state.
+
+        Returns:
+            the numbers of `step`, those from `fused.SHARE` on, and whether the last six of them are known.
+        """
+        stamp_s, (p, v, q, w), delay_s, frozen, integrate, dt_s = step
+        timed = reference_at if isinstance(reference_at, Timed) else None
+        curve = None if timed is None else timed.curve(stamp_s, delay_s)
+        if timed is None or curve is None:
+            self._pack(self._bytes, 0, stamp_s, 0.0, 0.0, 0.0, 1.0, *p, *v, *q, *w, dt_s, frozen, integrate)
+            self._give(reference_at(stamp_s + delay_s))
+        else:
+            begin_s, join_s = timed.begin_s, timed.join_s
+            self._pack(self._bytes, 0, stamp_s, 1.0, begin_s, join_s, 1.0, *p, *v, *q, *w, dt_s, frozen, integrate)
+        if attitude is None:
+            self._m[fused.ATTITUDE] = 0.0
+        else:
+            self._m[fused.ATTITUDE : fused.RESULTS] = attitude.at_s, *attitude.q, *attitude.w
+        self._kernel(self._m, prediction.numbers, self._no_curve if curve is None else curve)
+        return self._unpack(self._bytes, _RESULTS), self._unpack_rest(self._bytes, _REST), curve is not None
+
+    def _give(self, reference: Reference) -> None:
         p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
-        self._pack(
-            self._bytes, 0, *state.p, *state.v, *state.q, *state.w, *p, *v, *a, *j, *s, yaw, yaw_rate, yaw_acceleration,
-            thrust, dt_s, frozen, len(pieces), integrate,
-        )  # fmt: skip
-        at = 8 * flat.PIECES
-        for setpoint, rates, duration_s in pieces:
-            self._pack_piece(self._bytes, at, setpoint, *rates, duration_s)
-            at += 8 * flat.PIECE
-        self._kernel(self._x, self._c, self._y)
-        return self._unpack(self._result)
+        self._pack_reference(self._bytes, _REFERENCE, *p, *v, *a, *j, *s, yaw, yaw_rate, yaw_acceleration)
 
 
 class TrackerStep(NamedTuple):
@@ -217,6 +298,8 @@ class TrackerStep(NamedTuple):
     setpoint: Setpoint
     numbers: Numbers
     """Everything else, in the order that `control.flat` names."""
+    target: Target | None = None
+    """The reference at the state's stamp, where the step has found it on the way."""
 
     @property
     def errors(self) -> tuple[Vec3, Vec3, Vec3, Vec3]:
@@ -270,7 +353,7 @@ class Tracker:
     def __init__(self, vehicle: Vehicle, output: str, compiled: Kernels) -> None:
         self.vehicle = vehicle
         self.parameters = vehicle.parameters()
-        self._output = output
+        self._output, self._by_rates = output, output == "rates"
         x, y, z = vehicle.autopilot.rate_lag_s
         self._lags_s = (x, y, z, vehicle.rotors.lag_s)
         self._conversion = conversion(vehicle)
@@ -279,10 +362,10 @@ class Tracker:
         self._last_s: float | None = None
         self._slow_tau: Vec3 = ZERO
         self.delay_s = vehicle.delay_s if vehicle.controller.prediction else 0.0
-        self._prediction = self._new_prediction(0.0)
+        self._prediction = Prediction(vehicle.rotors.lag_s, self.delay_s, 0.0, compiled.engine)
         self._lags = self._factors()
         self._build: Callable[[Parameters], Engine] = lambda parameters: compiled.build(parameters, self._lags)
-        self._engine = self._build(self.parameters)
+        self._use(self._build(self.parameters))
         self._scale = ThrustScale(vehicle) if vehicle.controller.thrust_scale_estimate else None
         self._transition: Transition | None = None
         self.transitions: list[Transition] = []
@@ -298,8 +381,18 @@ class Tracker:
     def _factors(self) -> Factors:
         return factors(self._lags_s, self._prediction.length_s or self._interval_s)
 
-    def _new_prediction(self, thrust_n: float) -> Prediction:
-        return Prediction(self.vehicle.rotors.lag_s, self.delay_s, thrust_n)
+    def _use(self, engine: Engine) -> None:
+        """Steps with this engine from now on."""
+        self._engine = engine
+        self._whole = engine if isinstance(engine, CompiledEngine) else None
+        self._inform()
+
+    def _inform(self) -> None:
+        """Tells an engine that makes whole steps what it needs for them."""
+        if self._whole is not None:
+            x, y, z, _ = self._lags_s
+            self._whole.convert(self._conversion.thrust_full_n, self._conversion.curve_factor)
+            self._whole.predict((x, y, z), self.delay_s)
 
     def begin(self, state: State, thrust_n: float | None = None) -> None:
         """Starts the controller's state from a hover: T(0), T'(0) = 0 and b_hat(0) such that nothing steps (section 8).
@@ -318,10 +411,11 @@ class Tracker:
         if self.vehicle.controller.disturbance_start == "hover":
             _, b_hat = start(thrust, state.q, model.mass, model.gravity, limits.disturbance_max)
         self._engine.begin(ControllerState(thrust, 0.0, b_hat, HeadingState(r2, r1, False), ZERO))
-        self._prediction = self._new_prediction(thrust)
+        self._prediction.begin(thrust)
         if self._scale is not None:
             self._scale = ThrustScale(self.vehicle)
             self._conversion = conversion(self.vehicle)
+            self._inform()
         self._slow_tau = ZERO
         self._last_s = None
         self._attitude = None
@@ -347,18 +441,45 @@ class Tracker:
             self._retime(self._delay_wanted_s, stamp_s)
         if self._transition is not None:
             self._follow(self._transition, stamp_s, state)
-        pieces = prediction.pieces(stamp_s)
         if self._scale is not None:
+            prediction.follow(stamp_s)
             self._weigh(self._scale, stamp_s, state, integrate)
-            pieces = prediction.pieces(stamp_s)
-        if self._attitude is not None and self._attitude.at_s > stamp_s:
-            state = self._refreshed(state, stamp_s, self._attitude, pieces)
-        reference = reference_at(stamp_s + self.delay_s)
-        numbers = self._engine.step(state, reference, prediction.thrust, pieces, frozen or not integrate, integrate, dt)
-        prediction.sent(stamp_s, numbers[flat.THRUST], numbers[flat.RATES_MODEL])
-        if self._scale is not None and int(numbers[flat.LIMITS]) & THRUST_LIMITS:
+        attitude = self._attitude
+        if attitude is not None and attitude.at_s <= stamp_s:
+            attitude = self._attitude = None
+        start = WholeStep(stamp_s, state, self.delay_s, frozen or not integrate, integrate, dt)
+        out = (
+            self._step(start, reference_at, attitude)
+            if self._whole is None
+            else self._fly(self._whole, start, reference_at, attitude)
+        )
+        if self._scale is not None and int(out.numbers[flat.LIMITS]) & THRUST_LIMITS:
             self._scale.interrupt()
-        return TrackerStep(self._convert(numbers, dt), numbers)
+        return out
+
+    def _step(self, start: WholeStep, reference_at: ReferenceAt, attitude: Attitude | None) -> TrackerStep:
+        """The step put together here."""
+        stamp_s, state, delay_s, frozen, integrate, dt_s = start
+        prediction = self._prediction
+        pieces = prediction.pieces(stamp_s)
+        if attitude is not None:
+            x, y, z, _ = self._lags_s
+            state, used = refreshed(state, stamp_s, attitude, pieces, 0, len(pieces) // PIECE, (x, y, z))
+            self.refreshed += used
+        reference = reference_at(stamp_s + delay_s)
+        numbers = self._engine.step(state, reference, prediction.thrust, pieces, frozen, integrate, dt_s)
+        prediction.sent(stamp_s, numbers[flat.THRUST], numbers[flat.RATES_MODEL])
+        return TrackerStep(self._convert(numbers, dt_s), numbers)
+
+    def _fly(
+        self, whole: CompiledEngine, start: WholeStep, reference_at: ReferenceAt, attitude: Attitude | None
+    ) -> TrackerStep:
+        """The step as one call."""
+        n, rest, on_curve = whole.fly(start, self._prediction, reference_at, attitude)
+        share, used, px, py, pz, vx, vy, vz = rest
+        self.refreshed += used > 0.5
+        setpoint = RateSetpoint(share, (n[1], n[2], n[3])) if self._by_rates else self._convert(n, start.dt_s)
+        return TrackerStep(setpoint, n, Target((px, py, pz), (vx, vy, vz)) if on_curve else None)
 
     # -- the thrust's scale ---------------------------------------------------------------------------------------
 
@@ -388,18 +509,13 @@ class Tracker:
         self._prediction.rescale(ratio)
         self._engine.begin(controller._replace(thrust=thrust, thrust_rate=ratio * controller.thrust_rate, b_hat=b_hat))
         self._conversion = self._conversion._replace(thrust_full_n=self.vehicle.thrust_full_n * scale.used)
+        self._inform()
 
     # -- what the states alone do not tell ------------------------------------------------------------------------
 
     def refresh(self, attitude: Attitude) -> None:
         """An attitude that may be newer than the next state: the prediction's rotation then starts from it."""
         self._attitude = attitude
-
-    def _refreshed(self, state: State, stamp_s: float, attitude: Attitude, pieces: list[Piece]) -> State:
-        x, y, z, _ = self._lags_s
-        found = refreshed(state, stamp_s, attitude, pieces, (x, y, z))
-        self.refreshed += found is not state
-        return found
 
     def retime(self, delay_s: float) -> None:
         """Predicts over another delay from the next state on [s]; nothing changes where nothing is predicted."""
@@ -413,6 +529,7 @@ class Tracker:
         self._prediction.retime(delay_s)
         self._lags = self._factors()
         self._engine.relag(self._lags)
+        self._inform()
 
     def foresee(self, stamp_s: float) -> tuple[State, float] | None:
         """The state at a stamp, from the last one and the commands since, and the thrust over the mass [m/s^2]; None
@@ -479,7 +596,7 @@ class Tracker:
         if isinstance(engine, Turning):
             engine.share = share
             if share == 1.0:
-                self._engine = engine.new
+                self._use(engine.new)
         if share == 1.0:
             self._transition = None
 
@@ -488,7 +605,7 @@ class Tracker:
         r1, r2, _ = axes(state.q)
         engine = self._build(self.parameters)
         engine.begin(self._engine.controller._replace(heading=HeadingState(r2, r1, False)))
-        self._engine = Turning(self._engine, engine, kind)
+        self._use(Turning(self._engine, engine, kind))
 
     def _convert(self, n: Numbers, dt_s: float) -> Setpoint:
         rates = (n[1], n[2], n[3])

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from companion.control import history
 from companion.control.model import advance, factors, lagged
 from companion.control.types import State
 from companion.control.vectors import axes, quat_exp, quat_multiply, quat_normalise
@@ -48,23 +49,24 @@ def test_the_model_agrees_with_an_integrated_rigid_body():
 def test_pieces_cover_the_delay_with_the_commands_in_their_order(delay, interval, jitter):
     """The integral of the commands over any delay is that of the piecewise constant history."""
     prediction = Prediction(0.05, delay, 10.0)
-    stamp, history = 1.0, []
+    stamp, sent = 1.0, []
     for i, factor in enumerate(jitter):
-        pieces = prediction.pieces(stamp)
-        if history:
+        numbers = prediction.pieces(stamp)
+        pieces = [(t, (x, y, z), s) for t, x, y, z, s in zip(*[iter(numbers)] * 5, strict=True)]
+        if sent:
             assert sum(p[2] for p in pieces) == pytest.approx(delay)
             assert max(p[2] for p in pieces) <= PIECE_MAX_S + 1e-9
             total = sum(p[1][0] * p[2] for p in pieces)
             expected = 0.0
-            for k, (since, value) in enumerate(history):
-                end = history[k + 1][0] if k + 1 < len(history) else math.inf
+            for k, (since, value) in enumerate(sent):
+                end = sent[k + 1][0] if k + 1 < len(sent) else math.inf
                 begin = since
                 expected += value * max(0.0, min(end, stamp + delay) - max(begin, stamp))
             assert total == pytest.approx(expected, abs=1e-4 * delay + 1e-6 * 30)
         elif pieces:
             assert all(p[0] == pytest.approx(10.0) and p[1] == (0.0, 0.0, 0.0) for p in pieces)  # the hover
         prediction.sent(stamp, 10.0 + i, (float(i), 0.0, 0.0))
-        history.append((stamp + delay, float(i)))
+        sent.append((stamp + delay, float(i)))
         stamp += interval * factor
 
 
@@ -83,4 +85,40 @@ def test_the_thrust_at_the_stamp_is_followed_with_the_lag():
 def test_without_delay_nothing_is_predicted():
     prediction = Prediction(0.05, 0.0, 10.0)
     prediction.sent(1.0, 11.0, (1.0, 0.0, 0.0))
-    assert prediction.pieces(1.01) == []
+    assert len(prediction.pieces(1.01)) == 0
+
+
+def test_a_history_that_overflows_forgets_its_oldest_and_one_that_goes_on_stays_small():
+    full = Prediction(0.05, 0.5, 10.0)
+    for i in range(3000):  # all of them are still to act
+        full.sent(1e-4 * i, float(i), (0.0, 0.0, 0.0))
+    spans = full.between(0.0, 10.0)
+    assert [thrust for thrust, _, _ in spans][-3:] == [2997.0, 2998.0, 2999.0]
+    assert len(spans) == (history.CAPACITY - history.COMMANDS) // history.COMMAND
+    going_on, most = Prediction(0.05, 0.04, 10.0), 0
+    for i in range(3000):
+        going_on.pieces(0.004 * i)
+        going_on.sent(0.004 * i, float(i), (0.0, 0.0, 0.0))
+        most = max(most, int(going_on.numbers[history.END]))
+    assert most < 3 * history.FORGOTTEN_MAX
+    assert going_on.between(0.004 * 2999, 20.0)[-1][0] == 2999.0
+
+
+@pytest.mark.numba
+@given(
+    delay=st.floats(0.0, 0.09),
+    commands=st.lists(st.tuples(st.floats(0.0005, 0.03), st.floats(0.0, 30.0), st.floats(-5.0, 5.0)), max_size=80),
+)
+def test_compiled_code_keeps_the_same_history(delay, commands):
+    plain, compiled = (Prediction(0.05, delay, 10.0, engine) for engine in ("python", "numba"))
+    stamp = 1.0
+    for i, (interval, thrust, rate) in enumerate(commands):
+        stamp += interval
+        seen = [list(map(float, p.pieces(stamp))) for p in (plain, compiled)]
+        assert seen[0] == pytest.approx(seen[1], rel=1e-12, abs=1e-12)
+        assert plain.thrust == pytest.approx(compiled.thrust, rel=1e-12)
+        for p in (plain, compiled):
+            p.sent(stamp, thrust, (rate, -rate, 0.5 * rate))
+            if i == 40:
+                p.retime(0.7 * delay)
+                p.rescale(1.1)

@@ -8,9 +8,9 @@ import pytest
 
 from companion.config import FlightLimits, load_vehicle
 from companion.control import flat
+from companion.control.history import Attitude, refreshed
 from companion.control.types import Reference, State
 from companion.control.vectors import quat_exp, quat_multiply, rotate_to_inertial
-from companion.flight.prediction import Attitude, refreshed
 from companion.flight.resets import Reset, Resets, about_vertical, jump
 from companion.flight.tracker import Tracker, kernels
 from companion.frames import quat_from_yaw
@@ -150,20 +150,24 @@ def test_the_rotation_starts_from_a_newer_attitude() -> None:
         turned = [span * r + (x - r) * (1.0 - d) * lag for x, r, d, lag in zip(w, rates, decay, lags, strict=True)]
         q = quat_multiply(q, quat_exp(tuple(turned)))
         w = [r + (x - r) * d for x, r, d in zip(w, rates, decay, strict=True)]
-    found = refreshed(state, 1.0, Attitude(1.014, q, tuple(w)), pieces, lags)
+    numbers = [x for thrust, rates, span in pieces for x in (thrust, *rates, span)]
+    found, used = refreshed(state, 1.0, Attitude(1.014, q, tuple(w)), numbers, 0, 2, lags)
+    assert used
     assert found.q == pytest.approx(state.q, abs=1e-12)
     assert found.w == pytest.approx(state.w, abs=1e-12)
     assert (found.p, found.v) == (state.p, state.v)
     # What is newly known reaches the state: 0.02 rad further round, 0.02 rad further round before.
     more = quat_multiply(q, quat_exp((0.02, 0.0, 0.0)))
-    assert refreshed(state, 1.0, Attitude(1.014, more, tuple(w)), pieces, lags).q != pytest.approx(state.q, abs=1e-3)
+    found, used = refreshed(state, 1.0, Attitude(1.014, more, tuple(w)), numbers, 0, 2, lags)
+    assert used and found.q != pytest.approx(state.q, abs=1e-3)
 
 
 def test_an_attitude_of_another_estimate_or_beyond_the_prediction_is_left_alone() -> None:
-    pieces = [(9.81, ZERO, 0.01)]
+    pieces = [9.81, *ZERO, 0.01]
     state = State(ZERO, ZERO, (1.0, 0.0, 0.0, 0.0), ZERO)
     for at_s, q in ((1.005, quat_from_yaw(0.2)), (1.02, quat_from_yaw(0.01))):
-        assert refreshed(state, 1.0, Attitude(at_s, q, ZERO), pieces, (0.04, 0.04, 0.08)) is state
+        found = refreshed(state, 1.0, Attitude(at_s, q, ZERO), pieces, 0, 1, (0.04, 0.04, 0.08))
+        assert found == (state, False)
 
 
 def test_the_tracker_uses_only_attitudes_that_are_newer_than_the_state() -> None:

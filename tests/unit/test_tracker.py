@@ -7,9 +7,10 @@ import pytest
 
 from companion.config import load_flight, load_vehicle
 from companion.control import flat
+from companion.control.history import Attitude
 from companion.control.types import State
 from companion.control.vectors import quat_normalise
-from companion.flight.course import Course, at_rest
+from companion.flight.course import Course, Timed, at_rest
 from companion.flight.delay import CHANGE_MAX_S
 from companion.flight.tracker import Tracker, kernels
 from companion.trajectory.load import load
@@ -40,11 +41,29 @@ def test_both_engines_give_the_same_numbers(output, heading):
         stamp += 0.5 if i % 97 == 96 else rng.choice([0.004, 0.004, 0.008, 0.02])
         state = random_state(rng, rng.choice([0.5, 4.0, 40.0]))
         frozen = i % 13 == 0
-        plain, compiled = (t.step(stamp, state, lambda s: course.at(s - 1.0), frozen=frozen) for t in trackers)
+        if i == 200:  # the estimate was reset: from here on all of the course is elsewhere
+            course.shift((0.3, -0.2, 0.1))
+        if i % 3 == 0:  # of before or after the state, near its attitude or not
+            q = quat_normalise(tuple(x + rng.uniform(-0.01, 0.01) * (1 + 9 * (i % 2)) for x in state.q))
+            for t in trackers:
+                t.refresh(Attitude(stamp + 0.003 * (i % 5 - 1), q, state.w))
+        if i % 50 == 49:
+            delay_s = trackers[0].delay_s + rng.uniform(-0.003, 0.003)
+            for t in trackers:
+                t.retime(delay_s)
+        # the plain one asks the course; the compiled one has the trajectory as numbers, and asks before it begins
+        plain = trackers[0].step(stamp, state, lambda s: course.at(s - 1.5), frozen=frozen)
+        compiled = trackers[1].step(stamp, state, Timed(course, 1.5), frozen=frozen)
+        at_stamp = course.at(stamp - 1.5)
+        assert (compiled.target is not None) == (stamp >= 1.5)
+        if compiled.target is not None:
+            assert compiled.target.p == pytest.approx(at_stamp.p, abs=1e-12)
+            assert compiled.target.v == pytest.approx(at_stamp.v, abs=1e-12)
         scale = [1.0 + abs(x) for x in plain.numbers]
         for a, b, size in zip(plain.numbers, compiled.numbers, scale, strict=True):
             assert a == pytest.approx(b, abs=1e-12 * size, nan_ok=True)
         assert plain.setpoint[0] == pytest.approx(compiled.setpoint[0], abs=1e-12)
+    assert trackers[0].refreshed == trackers[1].refreshed > 10
 
 
 def test_a_gap_is_not_integrated_over():

@@ -12,12 +12,13 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from companion import accelerate
 from companion.config import find, load_flight
 from companion.control.types import State
-from companion.flight.course import Course
+from companion.flight.course import Course, Timed
 from companion.flight.tracker import Tracker, kernels
 from companion.trajectory.load import load
 from sim_link import vehicle_file
@@ -28,6 +29,8 @@ from sim_link.wind import World
 from .common import PYTHON, NotHereError, Row, Setting, median, module_environment, p50_p99, times_us, verdict
 
 ROUNDS, CALLS = 15, 200
+FLOWN_S = 1000.0
+"""Longer than any figure takes: all steps are on the trajectory."""
 HOW_TO_GET_ROTORPY = "RotorPy is not importable: install it somewhere and name that Python with --rotorpy-python"
 
 
@@ -85,11 +88,12 @@ def rotorpy(setting: Setting) -> Iterator[RotorPy]:
 def control_step(engine: str) -> Callable[[int], object]:
     """The control step as the loop calls it: history, prediction, reference, law, conversion into a setpoint."""
     vehicle = load_flight("paper").vehicle
-    course = Course(load("paper"), vehicle, (0.0, 0.0, -10.0), 0.0, None)
+    course = Course(replace(load("paper"), duration_s=FLOWN_S), vehicle, (0.0, 0.0, -10.0), 0.0, None)
     state = State((0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1))
     tracker = Tracker(vehicle, "rates", kernels(engine))
     tracker.begin(state)
-    return lambda i: tracker.step(1.0 + 0.004 * i, state, course.at)
+    reference_at = Timed(course, 0.0)
+    return lambda i: tracker.step(1.0 + 0.004 * i, state, reference_at)
 
 
 def physics_steps(engine: str, count: int) -> Callable[[int], object]:
