@@ -57,6 +57,7 @@ class KeptSigner(Signer):
         self._wake = threading.Event()
         self.problem = ""
         """Why the times cannot be kept at present."""
+        self._storing = threading.Lock()
         self.keep()
         if self.problem:
             place.release()
@@ -65,12 +66,13 @@ class KeptSigner(Signer):
         self._thread.start()
 
     def keep(self) -> None:
-        """Writes the times, and those ahead that count as used, to the disk."""
+        """Writes the times, and those ahead that count as used, to the disk; from any thread."""
         now = self.now()
         used = max(self._used(), self._zero + time.monotonic_ns() // NS_PER_UNIT)
         reserved = max(used + _RESERVE, now + _SIGNED)
         try:
-            self._place.store(self.times, used, reserved, ended=False)
+            with self._storing:
+                self._place.store(self.times, used, reserved, ended=False)
             self.times.reserved = reserved
             self.problem = ""
         except OSError as error:
