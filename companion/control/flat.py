@@ -44,21 +44,23 @@ PIECES = CONTROLLER + 15
 """Where the pieces begin."""
 CONSTANTS = 36
 
-# where things stand in the results
-THRUST = 0
-RATES = slice(1, 4)
-RATES_MODEL = slice(4, 7)
-TAU = slice(7, 10)
-LIMITS = 10
-TOTAL = 11
-TOTAL_RATE = 12
-B_HAT = slice(13, 16)
-ERRORS = slice(16, 28)
-HEADING_ERROR = 28
-LYAPUNOV = 29
-PREDICTED_Q = slice(30, 34)
-PREDICTED_W = slice(34, 37)
+# where things stand in the results: in the order of a flight's record (`record.columns`), then what is not in it
+HEADING_ERROR = 0
+ERRORS = slice(1, 13)
+LYAPUNOV = 13
+B_HAT = slice(14, 17)
+TOTAL = 17
+TOTAL_RATE = 18
+TAU = slice(19, 22)
+RATES = slice(22, 25)
+LIMITS = 25
+PREDICTED_Q = slice(26, 30)
+PREDICTED_W = slice(30, 33)
+THRUST = 33
+RATES_MODEL = slice(34, 37)
 RESULTS = 37
+RECORDED = slice(HEADING_ERROR, LIMITS), slice(LIMITS, THRUST)
+"""The two parts that stand together in the record."""
 
 
 def constants(parameters: Parameters, lags: Factors) -> list[float]:
@@ -121,26 +123,26 @@ def control_step(x: MutableSequence[float], c: Sequence[float], y: MutableSequen
     if x[INTEGRATE] < 0.5:
         after = controller
     e = out.errors
-    y[0] = command.thrust
-    y[10] = float(command.limits)
-    y[11] = after.thrust
-    y[12] = after.thrust_rate
-    y[28] = out.heading_error
-    y[29] = lyapunov(e, gains.p_max)
-    y[30], y[31], y[32], y[33] = state.q
+    y[HEADING_ERROR] = out.heading_error
+    y[LYAPUNOV] = lyapunov(e, gains.p_max)
+    y[TOTAL] = after.thrust
+    y[TOTAL_RATE] = after.thrust_rate
+    y[LIMITS] = float(command.limits)
+    y[THRUST] = command.thrust
+    y[26], y[27], y[28], y[29] = state.q
     x[36] = after.thrust
     x[37] = after.thrust_rate
     x[47] = 1.0 if after.heading.held else 0.0
     for i in range(3):
-        y[1 + i] = command.rates[i]
-        y[4 + i] = command.rates_model[i]
-        y[7 + i] = command.tau[i]
-        y[13 + i] = after.b_hat[i]
-        y[16 + i] = e.e1[i]
-        y[19 + i] = e.e2[i]
-        y[22 + i] = e.e3[i]
-        y[25 + i] = e.e4[i]
-        y[34 + i] = state.w[i]
+        y[1 + i] = e.e1[i]
+        y[4 + i] = e.e2[i]
+        y[7 + i] = e.e3[i]
+        y[10 + i] = e.e4[i]
+        y[14 + i] = after.b_hat[i]
+        y[19 + i] = command.tau[i]
+        y[22 + i] = command.rates[i]
+        y[30 + i] = state.w[i]
+        y[34 + i] = command.rates_model[i]
         x[38 + i] = after.b_hat[i]
         x[41 + i] = after.heading.r2d[i]
         x[44 + i] = after.heading.forward[i]
@@ -153,8 +155,8 @@ def results(
     """The RESULTS numbers of a step that was computed with nested tuples."""
     e = out.errors
     return (
-        *(command.thrust, *command.rates, *command.rates_model, *command.tau, float(command.limits)),
-        *(after.thrust, after.thrust_rate, *after.b_hat),
-        *(*e.e1, *e.e2, *e.e3, *e.e4, out.heading_error, lyapunov(e, p_max)),
-        *(*predicted.q, *predicted.w),
+        *(out.heading_error, *e.e1, *e.e2, *e.e3, *e.e4, lyapunov(e, p_max)),
+        *(*after.b_hat, after.thrust, after.thrust_rate, *command.tau, *command.rates),
+        *(float(command.limits), *predicted.q, *predicted.w),
+        *(command.thrust, *command.rates_model),
     )

@@ -75,7 +75,8 @@ def flight_step(m: Any, h: MutableSequence[float], r: Sequence[float]) -> None:
     y = m[RESULTS:SHARE]
     control_step(x, m[CONSTANTS:CONVERSION], y)
     if m[WHOLE] > 0.5:
-        remember(h, stamp_s + m[DELAY], y[flat.THRUST], y[4], y[5], y[6])
+        i = flat.THRUST  # the rates of the model stand behind it
+        remember(h, stamp_s + m[DELAY], y[i], y[i + 1], y[i + 2], y[i + 3])
     m[SHARE] = thrust_fraction(y[flat.THRUST], m[CONVERSION], m[CONVERSION + 1])
 
 

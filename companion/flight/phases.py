@@ -32,6 +32,9 @@ class Phase(StrEnum):
     PAUSE = "pause"
     """The course is slowed to rest, at rest, or getting back to its pace, as an operator asked."""
 
+    __hash__ = str.__hash__
+    """An enumeration's own is a call into Python, at every step."""
+
 
 PHASE_NAMES = tuple(phase.value for phase in Phase)
 PHASE_INDEX = {phase: float(index) for index, phase in enumerate(Phase)}

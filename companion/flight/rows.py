@@ -11,6 +11,8 @@ from companion.flight.phases import PHASE_INDEX, Phase
 from companion.flight.tracker import Target, TrackerStep
 from companion.link.telemetry import VehicleState
 
+_LAW, _LIMITS = flat.RECORDED
+
 
 class StepTiming(NamedTuple):
     """How a step went; all but `skipped` are wall-clock measurements."""
@@ -42,10 +44,9 @@ def control_row(
         timing: how it went.
     """
     n = out.numbers
+    t_us, p, v, q, w, _ = state
+    age_ms, took_us, late, skipped = timing
     return (
-        (state.t_vehicle_us * 1e-6, track_s, PHASE_INDEX[phase], *state.p, *state.v, *state.q, *state.w)
-        + (*target.p, *target.v, *error, n[flat.HEADING_ERROR], *n[flat.ERRORS], n[flat.LYAPUNOV])
-        + (*n[flat.B_HAT], n[flat.TOTAL], n[flat.TOTAL_RATE], *n[flat.TAU], *n[flat.RATES])
-        + (thrust_of(out.setpoint), timing.age_ms, timing.took_us, float(timing.late), float(timing.skipped))
-        + (n[flat.LIMITS], *n[flat.PREDICTED_Q], *n[flat.PREDICTED_W])
+        *(t_us * 1e-6, track_s, PHASE_INDEX[phase], *p, *v, *q, *w, *target.p, *target.v, *error, *n[_LAW]),
+        *(thrust_of(out.setpoint), age_ms, took_us, float(late), float(skipped), *n[_LIMITS]),
     )

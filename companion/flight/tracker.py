@@ -310,20 +310,17 @@ class TrackerStep(NamedTuple):
     @property
     def rates(self) -> Vec3:
         """Body rate setpoint [rad/s]."""
-        n = self.numbers
-        return (n[1], n[2], n[3])
+        return _vec3(self.numbers[flat.RATES])
 
     @property
     def tau(self) -> Vec3:
         """Angular acceleration [rad/s^2]."""
-        n = self.numbers
-        return (n[7], n[8], n[9])
+        return _vec3(self.numbers[flat.TAU])
 
     @property
     def b_hat(self) -> Vec3:
         """Disturbance estimate after the step, NED [m/s^2]."""
-        n = self.numbers
-        return (n[13], n[14], n[15])
+        return _vec3(self.numbers[flat.B_HAT])
 
 
 def conversion(vehicle: Vehicle) -> Conversion:
@@ -478,7 +475,10 @@ class Tracker:
         n, rest, on_curve = whole.fly(start, self._prediction, reference_at, attitude)
         share, used, px, py, pz, vx, vy, vz = rest
         self.refreshed += used > 0.5
-        setpoint = RateSetpoint(share, (n[1], n[2], n[3])) if self._by_rates else self._convert(n, start.dt_s)
+        if self._by_rates:
+            setpoint: Setpoint = RateSetpoint(share, _vec3(n[flat.RATES]))
+        else:
+            setpoint = self._convert(n, start.dt_s)
         return TrackerStep(setpoint, n, Target((px, py, pz), (vx, vy, vz)) if on_curve else None)
 
     # -- the thrust's scale ---------------------------------------------------------------------------------------
@@ -608,11 +608,17 @@ class Tracker:
         self._use(Turning(self._engine, engine, kind))
 
     def _convert(self, n: Numbers, dt_s: float) -> Setpoint:
-        rates = (n[1], n[2], n[3])
-        if self._output == "rates":
-            return rates_output(n[flat.THRUST], rates, self._conversion)
-        tau, w = (n[7], n[8], n[9]), (n[34], n[35], n[36])
+        rates, thrust = _vec3(n[flat.RATES]), n[flat.THRUST]
+        if self._by_rates:
+            return rates_output(thrust, rates, self._conversion)
+        tau, w = _vec3(n[flat.TAU]), _vec3(n[flat.PREDICTED_W])
         if self._output == "actuators":
             ahead, self._slow_tau = lead(tau, self._slow_tau, self.vehicle.rotors.lag_s, dt_s)
-            return actuator_output(n[flat.THRUST], ahead, w, self._conversion)
-        return attitude_output(n[flat.THRUST], rates, tau, (n[30], n[31], n[32], n[33]), w, self._conversion)
+            return actuator_output(thrust, ahead, w, self._conversion)
+        a, b, c, d = n[flat.PREDICTED_Q]
+        return attitude_output(thrust, rates, tau, (a, b, c, d), w, self._conversion)
+
+
+def _vec3(numbers: Numbers) -> Vec3:
+    x, y, z = numbers
+    return x, y, z

@@ -112,7 +112,7 @@ def test_no_command_steps_when_the_way_begins_and_on_it_they_part_slowly(kinds):
     a, b, c = (hover(tracker, 3, 3, state=state) for tracker in (plain, ramped, jumped))
 
     def apart(x, y):
-        return max(abs(p - q) for p, q in zip(x[flat.RATES] + (x[0],), y[flat.RATES] + (y[0],), strict=True))
+        return max(abs(p - q) for p, q in zip(x[flat.RATES] + (x[flat.THRUST],), y[flat.RATES] + (y[flat.THRUST],), strict=True))
 
     assert b[0] == pytest.approx(a[0], abs=1e-12, nan_ok=True) or kinds[0] != kinds[1]
     assert apart(a[0], b[0]) < 1e-12
@@ -126,10 +126,10 @@ def test_a_heading_of_another_kind_takes_over_little_by_little():
     tracker = begun(vehicle)
     tracker.retune(flown(changed(vehicle, heading="commanded"), tracker.parameters), 0.4)
     rows = hover(tracker, 130)
-    yaw = [n[9] for n in rows]  # at rest with a commanded heading of 0.3 rad
+    yaw = [n[flat.TAU][2] for n in rows]  # at rest with a commanded heading of 0.3 rad
     assert yaw[0] == 0.0
     other = begun(load_vehicle("bundled", {"controller": {"heading": "commanded"}}))
-    assert yaw[-1] == pytest.approx(hover(other, 130)[-1][9], rel=1e-8) and yaw[-1] > 0.25
+    assert yaw[-1] == pytest.approx(hover(other, 130)[-1][flat.TAU][2], rel=1e-8) and yaw[-1] > 0.25
     steps = [b - a for a, b in itertools.pairwise(yaw)]
     assert max(steps) < 1.3 * yaw[-1] / 100.0
 
