@@ -8,6 +8,7 @@ import os
 import pty
 import socket
 import termios
+import threading
 import time
 from typing import ClassVar
 
@@ -50,6 +51,18 @@ def listening(**options):
     port = free_port()
     with Wire.open(f"udpin:127.0.0.1:{port}", **options) as wire:
         yield wire, ("127.0.0.1", port)
+
+
+def test_a_wait_sleeps_first_then_looks_and_what_comes_meanwhile_ends_each():
+    with listening() as (wire, there), udp_socket() as vehicle:
+        vehicle.sendto(heartbeat(0), there)
+        assert len(wire.receive(0.0, 0.0, 60.0)) == 1  # the sleep ends; a minute is longer than a test may take
+        later = threading.Timer(0.05, vehicle.sendto, (heartbeat(1), there))
+        later.start()
+        frames = wire.receive(0.0, 60.0, 0.001)  # it comes while nobody sleeps: there is no other wait to find it
+        later.join()
+        assert [frame.seq for frame in frames] == [1]
+        assert wire.receive(0.0, 0.001, 0.001) == []
 
 
 def collect(wire: Wire, count: int) -> list[Frame]:

@@ -112,7 +112,10 @@ def test_no_command_steps_when_the_way_begins_and_on_it_they_part_slowly(kinds):
     a, b, c = (hover(tracker, 3, 3, state=state) for tracker in (plain, ramped, jumped))
 
     def apart(x, y):
-        return max(abs(p - q) for p, q in zip(x[flat.RATES] + (x[flat.THRUST],), y[flat.RATES] + (y[flat.THRUST],), strict=True))
+        return max(
+            abs(p - q)
+            for p, q in zip(x[flat.RATES] + (x[flat.THRUST],), y[flat.RATES] + (y[flat.THRUST],), strict=True)
+        )
 
     assert b[0] == pytest.approx(a[0], abs=1e-12, nan_ok=True) or kinds[0] != kinds[1]
     assert apart(a[0], b[0]) < 1e-12
