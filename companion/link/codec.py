@@ -40,6 +40,7 @@ MAV_STATE_ACTIVE: Final = 4
 MAV_FRAME_LOCAL_NED: Final = 1
 MAV_MODE_FLAG_SAFETY_ARMED: Final = 128
 
+_new = tuple.__new__  # of a NamedTuple, from its fields: its own constructor takes three times as long
 _HEARTBEAT = struct.Struct("<IBBBBB")
 COMMAND_LONG_LAYOUT = struct.Struct("<7fHBBB")
 COMMAND_ACK_LAYOUT = struct.Struct("<HBBiBB")
@@ -245,9 +246,8 @@ def decode_odometry(payload: bytes) -> Odometry:
     """ODOMETRY."""
     fields = _ODOMETRY.unpack_from(filled(payload, _ODOMETRY.size))
     t, x, y, z, q0, q1, q2, q3, vx, vy, vz, wx, wy, wz, frame, child, resets, estimator, quality = fields
-    return Odometry(
-        t, frame, child, (x, y, z), (q0, q1, q2, q3), (vx, vy, vz), (wx, wy, wz), resets, estimator, quality
-    )
+    p, q, v, w = (x, y, z), (q0, q1, q2, q3), (vx, vy, vz), (wx, wy, wz)
+    return _new(Odometry, (t, frame, child, p, q, v, w, resets, estimator, quality))
 
 
 def decode_attitude_quaternion(payload: bytes) -> AttitudeQuaternion:
@@ -258,7 +258,7 @@ def decode_attitude_quaternion(payload: bytes) -> AttitudeQuaternion:
 
 def decode_timesync(payload: bytes) -> Timesync:
     """TIMESYNC."""
-    return Timesync._make(_TIMESYNC.unpack_from(filled(payload, _TIMESYNC.size)))
+    return _new(Timesync, _TIMESYNC.unpack_from(filled(payload, _TIMESYNC.size)))
 
 
 def decode_heartbeat(payload: bytes) -> Heartbeat:

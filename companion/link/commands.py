@@ -147,8 +147,8 @@ class CommandQueue:
     def __init__(self, send: SendCommand) -> None:
         self._send = send
         self._lanes: dict[int, _Lane] = {}
-        self._busy: dict[int, _Lane] = {}
-        """Lanes with something to do: `update` comes with every state, and most commands are asked once."""
+        self.busy: dict[int, _Lane] = {}
+        """Lanes with something to do, for `update`: most commands are asked once."""
 
     def ask(self, command: int, params: Params, operation: Operation, retry: Retry, newest_wins: bool) -> Operation:
         """Ask for a command, from `operation.asked_s` on.
@@ -165,7 +165,7 @@ class CommandQueue:
         Returns:
             The operation that stands for the request, `operation` or the one that was there.
         """
-        lane = self._busy[command] = self._lanes.setdefault(command, _Lane(command, self._send))
+        lane = self.busy[command] = self._lanes.setdefault(command, _Lane(command, self._send))
         request = _Request(operation, params, retry)
         if not newest_wins:
             lane.add(request, operation.asked_s)
@@ -190,7 +190,7 @@ class CommandQueue:
 
     def update(self, now_s: float) -> None:
         """Repeat, give up, go on."""
-        for command, lane in tuple(self._busy.items()):
+        for command, lane in tuple(self.busy.items()):
             lane.update(now_s)
             if lane.idle:
-                del self._busy[command]
+                del self.busy[command]

@@ -22,10 +22,11 @@ SIGNED: Final = 0x01
 """Incompatibility flag of a signed frame; a frame with any other flag must not be read (MAVLink 2)."""
 SIGNATURE_BYTES: Final = 13
 
+_HEADER_V1 = struct.Struct("<BBBBBB")
 _HEADER_V2 = struct.Struct("<BBBBBBBHB")
+_new = tuple.__new__  # of a NamedTuple, from its fields: its own constructor takes three times as long
 _ANY_MAGIC = re.compile(b"[\xfd\xfe]")
 _UNFINISHED = -1
-_ZEROS = bytes(256)
 _CRC_EXTRA = [bytes((value,)) for value in range(256)]
 _REORDERED = 128  # a sequence step of this much or more is a late frame or a restarted sender, not a loss
 
@@ -139,7 +140,8 @@ class FrameParser:
         self._formats = formats
         self._counters = counters
         self._guard = guard
-        self._last_seq: dict[tuple[int, int], int] = {}
+        self._last_seq: dict[int, int] = {}
+        """By sender: its system id << 8 | its component id."""
 
     def parse(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes], final: bool = True) -> int:
         """Append the frames in `data` to `frames`; return how many bytes are done with.
@@ -159,10 +161,11 @@ class FrameParser:
         while at < end:
             length = _length(data, at, end)
             if length > 0:
-                raw = data if length == end else data[at : at + length]
-                following = data[at + length] if at + length < end else -1
+                stop = at + length
+                raw = data if length == end else data[at:stop]
+                following = data[stop] if stop < end else -1
                 if self._take(raw, following, wall_ns, frames, unknown):
-                    at += length
+                    at = stop
                     continue
             at = self._skip(data, at)
         return at
@@ -257,13 +260,12 @@ class FrameParser:
 
     def _take(self, raw: bytes, following: int, wall_ns: int, frames: list[Frame], unknown: list[bytes]) -> bool:
         """Check one whole candidate. True: its bytes are dealt with. False: the search must go on inside them."""
-        length = raw[1]
         if raw[0] == MAGIC_V2:
-            start, seq, sysid, compid = 10, raw[4], raw[5], raw[6]
-            msgid = raw[7] | raw[8] << 8 | raw[9] << 16
-            signed = raw[2] == SIGNED
+            _, length, flags, _, seq, sysid, compid, low, high = _HEADER_V2.unpack_from(raw)
+            start, msgid, signed = 10, low | high << 16, flags == SIGNED
         else:
-            start, seq, sysid, compid, msgid, signed = 6, raw[2], raw[3], raw[4], raw[5], False
+            start, signed = 6, False
+            _, length, seq, sysid, compid, msgid = _HEADER_V1.unpack_from(raw)
         known = self._formats.get(msgid)
         if known is None:
             # Cannot be checked. Believe its length only when another frame, or nothing, comes right behind it.
@@ -272,33 +274,35 @@ class FrameParser:
                 unknown.append(raw)
                 return True
             return False
+        crc_extra, whole = known
         stop = start + length
-        if mcrf4xx(raw[1:stop] + _CRC_EXTRA[known.crc_extra]) != raw[stop] | raw[stop + 1] << 8:
+        if mcrf4xx(raw[1:stop] + _CRC_EXTRA[crc_extra]) != raw[stop] | raw[stop + 1] << 8:
             self._counters.bad_crc += 1
             return False
         if self._guard is not None and not self._guard.verify(raw, msgid, signed):
             self._counters.bad_signature += 1
             return True
-        payload = raw[start:stop]
-        if length < known.length:
-            payload += _ZEROS[: known.length - length]
-        self._count(sysid, compid, seq)
-        frames.append(Frame(msgid, sysid, compid, seq, payload, raw, wall_ns))
+        payload = raw[start:stop].ljust(whole, b"\0")
+        self._counters.received += 1
+        sender = sysid << 8 | compid
+        if self._last_seq.get(sender) == (seq - 1) & 0xFF:
+            self._last_seq[sender] = seq
+        else:
+            self._count_lost(sender, seq)
+        frames.append(_new(Frame, (msgid, sysid, compid, seq, payload, raw, wall_ns)))
         return True
 
-    def _count(self, sysid: int, compid: int, seq: int) -> None:
-        """Count a good frame and what is missing before it."""
-        sender = (sysid, compid)
-        self._counters.received += 1
+    def _count_lost(self, sender: int, seq: int) -> None:
+        """Count what is missing before a good frame that does not follow the one before."""
+        ids = sender >> 8, sender & 0xFF
         last = self._last_seq.get(sender)
         if last is None:
-            self._counters.lost[sender] = 0
+            self._counters.lost[ids] = 0
         else:
             step = (seq - last) & 0xFF
             if step == 0 or step >= _REORDERED:
                 return
-            if step > 1:
-                self._counters.lost[sender] += step - 1
+            self._counters.lost[ids] += step - 1
         self._last_seq[sender] = seq
 
 
@@ -308,8 +312,7 @@ def build_frame(
     """A MAVLink 2 frame around a payload: trailing zeros trimmed but for the first byte, signed by a guard."""
     trimmed = payload.rstrip(b"\0") or payload[:1]
     flags = 0 if guard is None else SIGNED
-    head = _HEADER_V2.pack(MAGIC_V2, len(trimmed), flags, 0, seq, sysid, compid, msgid & 0xFFFF, msgid >> 16)
-    body = head + trimmed
+    body = _HEADER_V2.pack(MAGIC_V2, len(trimmed), flags, 0, seq, sysid, compid, msgid & 0xFFFF, msgid >> 16) + trimmed
     checksum = mcrf4xx(body[1:] + _CRC_EXTRA[crc_extra])
     frame = body + checksum.to_bytes(2, "little")
     return frame if guard is None else frame + guard.sign(frame)

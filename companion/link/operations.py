@@ -189,9 +189,12 @@ class Operations:
 
     def update(self, now_s: float) -> None:
         """Repeat what was not answered, give up what was asked often enough, send what waited."""
-        self._commands.update(now_s)
-        self._parameters.update(now_s)
-        self.texts.update(now_s)
+        if self._commands.busy:  # this comes with every state, and mostly nothing is asked
+            self._commands.update(now_s)
+        if self._parameters.asked:
+            self._parameters.update(now_s)
+        if self.texts.partial:
+            self.texts.update(now_s)
 
     def _for_us(self, system: int, component: int) -> bool:
         """Whether an answer's targets are ours or everybody's."""

@@ -29,7 +29,8 @@ class ParameterReader:
     def __init__(self, send: Callable[[str], object]) -> None:
         """`send` asks the autopilot for one name."""
         self._send = send
-        self._asked: dict[str, _Read] = {}
+        self.asked: dict[str, _Read] = {}
+        """What `update` has to look after; while it is empty nothing waits either."""
         self._waiting: deque[_Read] = deque()
 
     def ask(self, name: str, operation: Operation, retry: Retry) -> Operation:
@@ -41,7 +42,7 @@ class ParameterReader:
         """
         if not name or len(name) > NAME_MAX or not name.isascii():
             raise ValueError(f'"{name}" is no parameter name: 1 to {NAME_MAX} ASCII characters')
-        for read in (*self._asked.values(), *self._waiting):
+        for read in (*self.asked.values(), *self._waiting):
             if read.name == name:
                 return read.operation
         self._waiting.append(_Read(name, operation, retry))
@@ -50,7 +51,7 @@ class ParameterReader:
 
     def on_value(self, message: ParamValue, now_s: float) -> None:
         """Take a value; one that nobody asked for is ignored."""
-        read = self._asked.pop(message.name, None)
+        read = self.asked.pop(message.name, None)
         if read is None:
             return
         if message.value is None:
@@ -62,7 +63,7 @@ class ParameterReader:
 
     def on_error(self, message: ParamError, now_s: float) -> None:
         """Take a refusal."""
-        read = self._asked.pop(message.name, None)
+        read = self.asked.pop(message.name, None)
         if read is None:
             return
         if message.error == _DOES_NOT_EXIST:
@@ -73,14 +74,12 @@ class ParameterReader:
 
     def update(self, now_s: float) -> None:
         """Repeat, or give up."""
-        if not self._asked:
-            return  # then nothing waits either
-        for read in list(self._asked.values()):
+        for read in list(self.asked.values()):
             read.due_s = min(read.due_s, now_s + read.retry.interval_s)  # should the caller's clock have been set back
             if now_s < read.due_s:
                 continue
             if read.operation.sends >= read.retry.tries:
-                del self._asked[read.name]
+                del self.asked[read.name]
                 detail = f"asked {read.operation.sends} times; the autopilot may not have it"
                 read.operation.end(Result.TIMEOUT, now_s, detail)
             else:
@@ -89,9 +88,9 @@ class ParameterReader:
 
     def _start(self, now_s: float) -> None:
         """Ask for the next names while there is room."""
-        while self._waiting and len(self._asked) < AT_ONCE:
+        while self._waiting and len(self.asked) < AT_ONCE:
             read = self._waiting.popleft()
-            self._asked[read.name] = read
+            self.asked[read.name] = read
             self._transmit(read, now_s)
 
     def _transmit(self, read: _Read, now_s: float) -> None:

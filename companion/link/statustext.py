@@ -52,14 +52,15 @@ class StatusTexts:
     def __init__(self) -> None:
         self.texts: deque[Announcement] = deque(maxlen=KEPT)
         """Whole texts, oldest first."""
-        self._partial: dict[int, _Partial] = {}
+        self.partial: dict[int, _Partial] = {}
+        """Texts of which chunks have not come yet, for `update`."""
 
     def add(self, message: StatusText, now_s: float) -> None:
         """Take one message."""
         if message.id == 0:
             self.texts.append(Announcement(now_s, message.severity, _readable(message.text)))
             return
-        partial = self._partial.setdefault(message.id, _Partial(now_s, message.severity))
+        partial = self.partial.setdefault(message.id, _Partial(now_s, message.severity))
         partial.chunks[message.chunk_seq] = message.text
         if message.complete:
             partial.last_chunk = message.chunk_seq
@@ -68,15 +69,13 @@ class StatusTexts:
 
     def update(self, now_s: float) -> None:
         """Give up on chunks that did not come."""
-        if not self._partial:
-            return
-        late = [key for key, partial in self._partial.items() if not 0.0 <= now_s - partial.started_s <= CHUNKS_WAIT_S]
+        late = [key for key, partial in self.partial.items() if not 0.0 <= now_s - partial.started_s <= CHUNKS_WAIT_S]
         for key in late:
             self._finish(key, now_s)
 
     def _finish(self, key: int, now_s: float) -> None:
         """Keep a text as far as it came."""
-        partial = self._partial.pop(key)
+        partial = self.partial.pop(key)
         self.texts.append(Announcement(now_s, partial.severity, partial.text()))
 
     def complaints(self, from_s: float, to_s: float) -> list[str]:

@@ -19,6 +19,7 @@ from companion.link.framing import Frame
 MAV_FRAME_LOCAL_NED: Final = 1
 MAV_FRAME_BODY_FRD: Final = 12
 
+_new = tuple.__new__  # of a NamedTuple, from its fields: its own constructor takes three times as long
 _VELOCITY_FRAMES: Final = frozenset((MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_FRD))
 
 QUATERNION_LENGTH: Final = (0.9, 1.1)
@@ -127,28 +128,28 @@ class Telemetry:
         """The state in the message, or what is wrong with it."""
         if frame.sysid != self.system_id or frame.compid != self.component_id:
             return StateRejection.NOT_FROM_AUTOPILOT
-        message = decode_odometry(frame.payload)
-        child = message.child_frame_id
-        if message.frame_id != MAV_FRAME_LOCAL_NED or child not in _VELOCITY_FRAMES:
+        t_us, frame_id, child, p, attitude, v, w, reset_counter, _, quality = decode_odometry(frame.payload)
+        if frame_id != MAV_FRAME_LOCAL_NED or child not in _VELOCITY_FRAMES:
             return StateRejection.UNKNOWN_FRAME
-        late = self._judge_stamp(message.time_usec)
+        late = self._judge_stamp(t_us)
         if late is not None:
             return late
-        numbers, before = (message.p, message.v, message.q, message.w), self._numbers
+        numbers, before = (p, v, attitude, w), self._numbers
         self._numbers = numbers
-        if numbers == before and max(map(abs, (*message.v, *message.w))) > FROZEN_ABOVE:
+        if numbers == before and max(map(abs, (*v, *w))) > FROZEN_ABOVE:
             return StateRejection.FROZEN
-        if message.quality < 0:
+        if quality < 0:
             return StateRejection.ESTIMATOR_FAILED
-        q = _unit(message.q)
+        q = _unit(attitude)
         if isinstance(q, StateRejection):
             return q
-        if not (_within(message.p, POSITION_MAX_M) and _within(message.v, SPEED_MAX_M_S)):
-            return _unusable(message.p, message.v)
-        if not _within(message.w, RATE_MAX_RAD_S):
-            return _unusable(message.w)
-        v = rotate_to_inertial(q, message.v) if child == MAV_FRAME_BODY_FRD else message.v
-        return VehicleState(message.time_usec, message.p, v, q, message.w, message.reset_counter)
+        if not (_within(p, POSITION_MAX_M) and _within(v, SPEED_MAX_M_S)):
+            return _unusable(p, v)
+        if not _within(w, RATE_MAX_RAD_S):
+            return _unusable(w)
+        if child == MAV_FRAME_BODY_FRD:
+            v = rotate_to_inertial(q, v)
+        return _new(VehicleState, (t_us, p, v, q, w, reset_counter))
 
     def _judge_stamp(self, t_us: int) -> StateRejection | None:
         """Whether time goes on as it should. A recognised reboot stays until `restart`."""
@@ -221,7 +222,8 @@ class Telemetry:
 
 def _within(a: Vec3, bound: float) -> bool:
     """Whether every component is within +-bound; NaN is not."""
-    return -bound <= a[0] <= bound and -bound <= a[1] <= bound and -bound <= a[2] <= bound
+    x, y, z = a
+    return -bound <= x <= bound and -bound <= y <= bound and -bound <= z <= bound
 
 
 def _unusable(*vectors: Vec3) -> StateRejection:
@@ -232,9 +234,9 @@ def _unusable(*vectors: Vec3) -> StateRejection:
 
 def _unit(q: Quat) -> Quat | StateRejection:
     """The quaternion at unit length, or why it is no attitude."""
-    length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    if not math.isfinite(length):
-        return StateRejection.NOT_FINITE
-    if not QUATERNION_LENGTH[0] <= length <= QUATERNION_LENGTH[1]:
-        return StateRejection.ZERO_QUATERNION
-    return (q[0] / length, q[1] / length, q[2] / length, q[3] / length)
+    w, x, y, z = q
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    least, most = QUATERNION_LENGTH
+    if least <= length <= most:
+        return (w / length, x / length, y / length, z / length)
+    return StateRejection.ZERO_QUATERNION if math.isfinite(length) else StateRejection.NOT_FINITE

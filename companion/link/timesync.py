@@ -28,7 +28,8 @@ def is_response(message: Timesync, own_system: int, own_component: int) -> bool:
 
 def _for_us(message: Timesync, own_system: int, own_component: int) -> bool:
     """Whether the targets are ours or everybody's."""
-    return message.target_system in {0, own_system} and message.target_component in {0, own_component}
+    _, _, system, component = message
+    return (not system or system == own_system) and (not component or component == own_component)
 
 
 def answer(request: Timesync, own_time_ns: int, requester_system: int, requester_component: int) -> bytes:
@@ -40,7 +41,7 @@ def answer(request: Timesync, own_time_ns: int, requester_system: int, requester
         requester_system: system id of the request's sender.
         requester_component: its component id.
     """
-    return encode_timesync(max(1, own_time_ns), request.ts1, requester_system, requester_component)
+    return encode_timesync(own_time_ns if own_time_ns > 1 else 1, request.ts1, requester_system, requester_component)
 
 
 def request(own_time_ns: int, target_system: int, target_component: int) -> bytes:

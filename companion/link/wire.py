@@ -290,10 +290,12 @@ class Wire:
         tap raises comes out once; it is shown nothing any more then, as the link is needed for the hand-over.
         """
         tap, untold = self._tap, self._untold
+        if not untold:
+            return
         try:
             if tap is not None:
-                for entry in untold:
-                    tap(*entry)
+                for direction, raw, wall_ns in untold:
+                    tap(direction, raw, wall_ns)
         except Exception:
             self._tap = None
             raise
