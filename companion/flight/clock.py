@@ -62,4 +62,4 @@ class VehicleClock:
         return (wall_ns - self._last_wall_ns) * 1e-9
 
     def _advance(self, t_s: float) -> None:
-        self._latest_s = max(self._latest_s, t_s)
+        self._latest_s = t_s if t_s > self._latest_s else self._latest_s

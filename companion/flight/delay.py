@@ -60,7 +60,8 @@ class Delay:
         if self.age_s is None or self._last_s is None:
             self.age_s, self._last_s, self._stepped_s = age_s, now_s, now_s
             return None
-        share = min(1.0, max(0.0, now_s - self._last_s) / SMOOTHING_S)
+        passed_s = now_s - self._last_s
+        share = 0.0 if passed_s <= 0.0 else 1.0 if passed_s >= SMOOTHING_S else passed_s / SMOOTHING_S
         self._last_s = now_s
         self.age_s += share * (age_s - self.age_s)
         if not self._follows or now_s - self._stepped_s < EVERY_S:

@@ -73,7 +73,8 @@ class Envelope:
             value = numbers[flat.LYAPUNOV]
             most = (math.sqrt(self._whole) + self.step_roots[0]) ** 2
             return (value, most, "all axes") if value > most else None
-        decay = self._decay[min(int((now_s - self._start_s) / STRIDE_S), STRIDES)]
+        stride = int((now_s - self._start_s) / STRIDE_S)
+        decay = self._decay[stride if stride < STRIDES else STRIDES]
         vertical = 0.5 * (z * z + z2 * z2 + z3 * z3 + z4 * z4)
         root = decay * self._roots[1] + self.step_roots[1]
         vertical_most = root * root

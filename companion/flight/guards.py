@@ -182,30 +182,31 @@ class Guards:
             what is to be done now, the hardest of several.
         """
         limits, flags = self._limits, int(numbers[flat.LIMITS])
+        since = self._since  # empty in almost all steps, and then not searched
         found: Finding | None = None
         size = math.hypot(*error)
         broken = size > limits.position_error_abort_m
-        if broken or Guard.POSITION_ERROR in self._since:
+        if broken or (since and Guard.POSITION_ERROR in since):
             found = self._judge(Guard.POSITION_ERROR, broken, size, limits.position_error_abort_m, "m", now_s)
         _, x, y, _ = q
-        if 1.0 - 2.0 * (x * x + y * y) < self._tilt_cosine or Guard.TILT in self._since:
+        if 1.0 - 2.0 * (x * x + y * y) < self._tilt_cosine or (since and Guard.TILT in since):
             tilt = tilt_from_quat(q)
             found = _harder(
                 found, self._judge(Guard.TILT, tilt > limits.tilt_max_rad, tilt, limits.tilt_max_rad, "rad", now_s)
             )
-        broken = rate_error > limits.rate_error_max_rad_s
-        if broken or Guard.FOLLOWING in self._since:
-            limit = limits.rate_error_max_rad_s
+        limit = limits.rate_error_max_rad_s
+        broken = rate_error > limit
+        if broken or (since and Guard.FOLLOWING in since):
             found = _harder(found, self._judge(Guard.FOLLOWING, broken, rate_error, limit, "rad/s", now_s))
         bound = self._p_max
         self._near = self._near or size < bound
-        if flags or size > bound or self._since:
+        if flags or size > bound or since:
             found = _harder(found, self._strained(flags, size, numbers, now_s))
         if self._envelope is not None:
             excess = self._envelope.excess(numbers, now_s)
             if excess is not None:
                 found = _harder(found, self._beyond_envelope(excess, now_s))
-            elif Guard.LYAPUNOV in self._since:
+            elif since and Guard.LYAPUNOV in since:
                 self._clear(Guard.LYAPUNOV)
                 self._clear(Guard.RUNAWAY)
         return found
@@ -287,7 +288,7 @@ class Guards:
         return Finding(guard, response, detail + lasted)
 
     def _clear(self, guard: Guard) -> None:
-        if guard in self._since:
+        if self._since and guard in self._since:
             del self._since[guard]
             self._answered.pop(guard, None)
 

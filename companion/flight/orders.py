@@ -75,14 +75,17 @@ class Orders:
         Raises:
             FlightEnded: there is nothing to be handed over.
         """
-        given, self._given = self._given, []
-        for order in given:
-            if self._sequence.ending is None:
-                self._follow(order, now_s)
-        if self._pacing is None:
+        if self._given:
+            given, self._given = self._given, []
+            for order in given:
+                if self._sequence.ending is None:
+                    self._follow(order, now_s)
+        pacing = self._pacing
+        if pacing is None:
             return
-        self._pacing.tick(self._t_s)
-        if self._sequence.phase is Phase.PAUSE and self._going_on and self._pacing.reached(self._t_s):
+        if pacing.plan is not None:
+            pacing.tick(self._t_s)
+        if self._going_on and self._sequence.phase is Phase.PAUSE and pacing.reached(self._t_s):
             self._sequence.enter(self._sequence.phase_on_course(self._t_s), now_s, "back at the course's own pace")
 
     @property

@@ -22,7 +22,8 @@ class Pacing:
     def __init__(self, course: Course, state_rate_hz: float) -> None:
         self._course = course
         self._wanted = 1.0
-        self._plan: RampPlan | None = None
+        self.plan: RampPlan | None = None
+        """The change of pace that `tick` plans; None: it has nothing to do."""
         plan = course.plan_pace(0.0, 1.0)
         self._samples = math.ceil(plan.samples_max / (PLANNING_S * state_rate_hz))
 
@@ -35,22 +36,22 @@ class Pacing:
         """
         if rate != self._wanted:
             self._wanted = rate
-            self._plan = self._course.plan_pace(t_s + LEAD_S, rate)
+            self.plan = self._course.plan_pace(t_s + LEAD_S, rate)
 
     def tick(self, t_s: float) -> None:
         """Plans on; called once per state, when its setpoint is out."""
-        if self._plan is None:
+        if self.plan is None:
             return
-        if t_s > self._plan.begin_s - LOOK_AHEAD_S:  # too late for this one: states came too rarely
-            self._plan = self._course.plan_pace(t_s + LEAD_S, self._wanted)
-        ramp = self._plan.work(self._samples)
+        if t_s > self.plan.begin_s - LOOK_AHEAD_S:  # too late for this one: states came too rarely
+            self.plan = self._course.plan_pace(t_s + LEAD_S, self._wanted)
+        ramp = self.plan.work(self._samples)
         if ramp is not None:
-            self._plan = None
+            self.plan = None
             self._course.change_pace(ramp)
 
     def reached(self, t_s: float) -> bool:
         """Whether the course has the pace that is wanted."""
-        if self._plan is not None:
+        if self.plan is not None:
             return False
         ramps = self._course.ramps
         return not ramps or t_s >= ramps[-1].begin_s + ramps[-1].duration_s

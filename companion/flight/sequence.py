@@ -64,6 +64,8 @@ FRESH_S = 0.5
 REASON_WAIT_S = 0.5
 """The autopilot's words about a refusal may come after its answer."""
 
+_FOLLOWS = {Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOLD}
+"""The phases of the course: the controller that flies it does so in OFFBOARD."""
 _AWAITED = {Phase.TAKEOFF: modes.TAKEOFF, Phase.JOIN: modes.HOLD, Phase.LAND: modes.LAND}
 """The autopilot's own modes that a phase asks for."""
 
@@ -149,6 +151,14 @@ class Sequence:
         self._hold_since_s: float | None = None
         self.orders = Orders(self, autopilot, flight.vehicle.link.state_rate_hz)
         """What the operator wants."""
+        self._goes_on: dict[Phase, Callable[[float], None]] = {
+            Phase.PREFLIGHT: self._prepare,
+            Phase.TAKEOFF: self._take_off,
+            Phase.JOIN: self._join,
+            Phase.HOLD: self._finish,
+            Phase.LAND: self._land,
+        }
+        """What time brings in the phases that wait for something."""
 
     @property
     def stamp_s(self) -> float:
@@ -208,19 +218,10 @@ class Sequence:
             self.orders.tick(now_s)
         if self.ending is not None:
             self._hand_over(now_s)
-        elif self.phase is Phase.PREFLIGHT:
-            if self.preflight.done(now_s):
-                self._after_preflight(now_s)
-        elif self.phase is Phase.TAKEOFF:
-            self._take_off(now_s)
-        elif self.phase is Phase.JOIN and self.duty is Duty.NOTHING:
-            self._hold_first(now_s)
-        elif self.phase is Phase.JOIN and self.duty is Duty.STREAM:
-            self._enter_offboard(now_s)
-        elif self.phase is Phase.HOLD:
-            self._finish(now_s)
-        elif self.phase is Phase.LAND:
-            self._land(now_s)
+            return
+        goes_on = self._goes_on.get(self.phase)
+        if goes_on is not None:
+            goes_on(now_s)
 
     def tell(self, line: str) -> None:
         """A line for people."""
@@ -278,7 +279,9 @@ class Sequence:
 
     # -- phases ---------------------------------------------------------------------------------------------------
 
-    def _after_preflight(self, now_s: float) -> None:
+    def _prepare(self, now_s: float) -> None:
+        if not self.preflight.done(now_s):
+            return
         if self._only_gates:
             raise FlightEnded(Cause.INSPECTED, "every gate lets it pass")
         landed = self._autopilot.landed
@@ -382,6 +385,12 @@ class Sequence:
         fresh = state is not None and now_s - self._state_s < FRESH_S
         return fresh and state is not None and max(abs(x) for x in state.v) < speed_m_s
 
+    def _join(self, now_s: float) -> None:
+        if self.duty is Duty.NOTHING:
+            self._hold_first(now_s)
+        elif self.duty is Duty.STREAM:
+            self._enter_offboard(now_s)
+
     def _hold_first(self, now_s: float) -> None:
         """The vehicle must hold, and be meant to, before a setpoint is sent: PX4 goes back to OFFBOARD by itself at the
         first one when that was the last mode asked for."""
@@ -473,9 +482,11 @@ class Sequence:
         course = self.course
         assert course is not None
         t = course.course_s(stamp_s - self.engaged_at_s)
-        if self.phase is Phase.JOIN and t >= course.join_s:
+        if t < course.join_s:
+            return
+        if self.phase is Phase.JOIN:
             self.enter(Phase.TRACK, stamp_s, "the join is done")
-        elif self.phase is Phase.TRACK and t >= course.join_s + course.track_s:
+        elif t >= course.join_s + course.track_s and self.phase is Phase.TRACK:
             self.enter(Phase.HOLD, stamp_s, "the trajectory is flown")
 
     def track_time_s(self, stamp_s: float) -> float:
@@ -543,6 +554,8 @@ class Sequence:
         if mode is None:
             return
         if self._other_mode_s is None:
+            if mode == modes.OFFBOARD and self._autopilot.armed and self.phase in _FOLLOWS and self.duty is Duty.TRACK:
+                return  # as it is to be for most of a flight
             if self.duty is Duty.TRACK and not self._autopilot.armed:
                 self.duty = Duty.NOTHING
                 raise FlightEnded(Cause.DISARMED, "nothing more is sent")

@@ -141,7 +141,7 @@ class Watch:
 
     def on_step(self, seen: Seen, course: Course, now_s: float) -> Finding | None:
         """Judges a control step whose setpoint is out; what is to be done about it."""
-        tracker = self._tracker
+        tracker, (state, error, out, _, late, age_s, _, _) = self._tracker, seen
         if tracker is not None:
             if tracker.changing:
                 self._retuned = True
@@ -150,10 +150,10 @@ class Watch:
                 self._retuned = False
                 self._guards.retune(tracker.parameters)
         self._steps += 1
-        self._late += seen.late
-        found = self._guards.step(seen.state.q, seen.error, seen.out.numbers, now_s, self._rate_error(seen))
-        if seen.age_s is not None:
-            delay_s = self.delay.on_age(seen.age_s, now_s)
+        self._late += late
+        found = self._guards.step(state.q, error, out.numbers, now_s, self._rate_error(state, out.numbers))
+        if age_s is not None:
+            delay_s = self.delay.on_age(age_s, now_s)
             if delay_s is not None and tracker is not None:
                 tracker.retime(delay_s)
         if now_s - self._slowly_s < SLOWLY_S - 1e-6:
@@ -162,11 +162,11 @@ class Watch:
         slow = self._guards.slowly(self._slow(seen, course, now_s), now_s)
         return slow if found is None or (slow is not None and slow.response > found.response) else found
 
-    def _rate_error(self, seen: Seen) -> float:
+    def _rate_error(self, state: VehicleState, numbers: tuple[float, ...]) -> float:
         """How far the body rates are off the commanded ones [rad/s]; 0 where it is not known."""
         if self._following is None or self._tracker is None:
             return 0.0
-        state, (roll, pitch, yaw) = seen.state, seen.out.numbers[flat.RATES]
+        roll, pitch, yaw = numbers[flat.RATES]
         return self._following.error(state.t_vehicle_us * 1e-6, state.w, (roll, pitch, yaw), self._tracker.delay_s)
 
     def _slow(self, seen: Seen, course: Course, now_s: float) -> Slow:
