@@ -360,7 +360,8 @@ class FlightLoop:
         if not self._peer.paced:
             self._answer_state()
             self._tick()
-        self._answer_requests()
+        if self._requests:
+            self._answer_requests()
         self._account()
         self._host.turn()
         self._look_at_the_wall_clock()
@@ -490,12 +491,15 @@ class FlightLoop:
         if now_s - self._heartbeat_s >= HEARTBEAT_INTERVAL_S:
             self._heartbeat_s = now_s
             send_heartbeat(self._wire)
-        if not self._peer.paced and self._watch.asks_time(wall_ns):
-            self._ops.ask_time(wall_ns)
-        # A better estimate of the vehicle's clock is no silence: only a vehicle in lockstep is judged by its own time.
-        silent_s = now_s - self._last_state_s if self._peer.paced else (wall_ns - self._last_arrival_ns) * 1e-9
-        away = wall_ns - self._turned_ns > AWAY_NS and not self._peer.paced  # then states wait to be read: look first
-        if sequence.duty is not Duty.NOTHING and silent_s > self._silence_s and not away:
+        if self._peer.paced:
+            silent_s, away = now_s - self._last_state_s, False
+        else:
+            if self._watch.asks_time(wall_ns):
+                self._ops.ask_time(wall_ns)
+            # A better estimate of the vehicle's clock is no silence: only in lockstep it is judged by its own time.
+            silent_s = (wall_ns - self._last_arrival_ns) * 1e-9
+            away = wall_ns - self._turned_ns > AWAY_NS  # then states wait to be read: look first
+        if silent_s > self._silence_s and not away and sequence.duty is not Duty.NOTHING:
             self._stop_answering(Cause.STATE_LOST, f"none for {self._silence_s * 1e3:.0f} ms", now_s)
         sequence.tick(now_s)
 
@@ -525,20 +529,19 @@ class FlightLoop:
             return
         if before is not None and before.reset_counter != state.reset_counter and not self._carry(state, now_s):
             return
-        if sequence.duty is Duty.CLIMB and not self._silent_too_long(state):
-            assert sequence.climb is not None
-            self._send(sequence.climb.setpoint(state.t_vehicle_us * 1e-6), state)
-            return
         if self._silent_too_long(state):
             assert self._sent_us is not None
             sequence.duty = Duty.NOTHING
             detail = f"none for {(state.t_vehicle_us - self._sent_us) * 1e-6:.2f} s of vehicle time"
             sequence.end(Cause.OWN_SILENCE, detail, now_s)
+        elif sequence.duty is Duty.TRACK:
+            self._lost += skipped
+            self._track(state, skipped, arrival_ns)
         elif sequence.duty is Duty.STREAM:
             self._stream(state)
         else:
-            self._lost += skipped
-            self._track(state, skipped, arrival_ns)
+            assert sequence.climb is not None
+            self._send(sequence.climb.setpoint(state.t_vehicle_us * 1e-6), state)
 
     def _carry(self, state: VehicleState, now_s: float) -> bool:
         """The autopilot's estimate was reset: the reference moves along. False: by too much, the flight ends."""

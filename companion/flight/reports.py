@@ -50,7 +50,7 @@ def take_heartbeat(autopilot: Autopilot, frame: Frame) -> None:
 def take_report(autopilot: Autopilot, frame: Frame) -> None:
     """CURRENT_MODE, EXTENDED_SYS_STATE, HOME_POSITION, ATTITUDE_TARGET, BATTERY_STATUS, SYS_STATUS, ESTIMATOR_STATUS;
     others, and what cannot be read, change nothing."""
-    if frame.msgid not in _REPORTS:
+    if frame.msgid not in _REPORTS or (frame.msgid == ATTITUDE_TARGET and autopilot.mode != HOLD):
         return
     message: Any = codec.decode_cold(frame)
     if message is None:
@@ -70,7 +70,7 @@ def take_report(autopilot: Autopilot, frame: Frame) -> None:
         if message.id == 0:
             autopilot.battery = None if message.battery_remaining < 0 else 1e-2 * message.battery_remaining
     elif frame.msgid == ATTITUDE_TARGET:
-        if autopilot.mode == HOLD and 0.0 < message.thrust < 1.0:
+        if 0.0 < message.thrust < 1.0:  # of the autopilot's own hover, by the mode above
             before = message.thrust if autopilot.hold_thrust is None else autopilot.hold_thrust
             autopilot.hold_thrust = before + HOLD_THRUST_SHARE * (message.thrust - before)
             if autopilot.gathers:

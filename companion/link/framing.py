@@ -14,7 +14,7 @@ from typing import Final, NamedTuple, Protocol
 
 from fastcrc.crc16 import mcrf4xx
 
-from companion.link.codec import MessageFormat
+from companion.link.codec import MessageFormat, new_record
 
 MAGIC_V1: Final = 0xFE
 MAGIC_V2: Final = 0xFD
@@ -24,7 +24,6 @@ SIGNATURE_BYTES: Final = 13
 
 _HEADER_V1 = struct.Struct("<BBBBBB")
 _HEADER_V2 = struct.Struct("<BBBBBBBHB")
-_new = tuple.__new__  # of a NamedTuple, from its fields: its own constructor takes three times as long
 _ANY_MAGIC = re.compile(b"[\xfd\xfe]")
 _UNFINISHED = -1
 _CRC_EXTRA = [bytes((value,)) for value in range(256)]
@@ -289,7 +288,7 @@ class FrameParser:
             self._last_seq[sender] = seq
         else:
             self._count_lost(sender, seq)
-        frames.append(_new(Frame, (msgid, sysid, compid, seq, payload, raw, wall_ns)))
+        frames.append(new_record(Frame, (msgid, sysid, compid, seq, payload, raw, wall_ns)))
         return True
 
     def _count_lost(self, sender: int, seq: int) -> None:
