@@ -7,13 +7,18 @@ allocates an array.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 
 GRAVITY_M_S2 = 9.81
 """The gravity that the law assumes; what the world has more or less of it is part of the disturbance."""
+
+
+new_record: Final = tuple.__new__
+"""Makes a NamedTuple of a tuple of all its fields: for what comes with every state, as its own constructor takes three
+times as long."""
 
 
 class State(NamedTuple):

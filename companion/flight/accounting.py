@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from companion.config import Flight
 from companion.control import flat
-from companion.control.types import Quat, Vec3
+from companion.control.types import Quat, Vec3, new_record
 from companion.flight.clock import VehicleClock
 from companion.flight.course import Course
 from companion.flight.guards import Finding
@@ -132,8 +132,8 @@ class Accounting:
         else:
             age_s = self._watch.age_s(state.t_vehicle_us, arrival_ns)
             sent_age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
-        timing = StepTiming(sent_age_ms, took_ns * 1e-3, took_ns > self._late_ns, step.skipped)
-        return Measured(target, (p[0] - d[0], p[1] - d[1], p[2] - d[2]), timing, age_s)
+        timing = new_record(StepTiming, (sent_age_ms, took_ns * 1e-3, took_ns > self._late_ns, step.skipped))
+        return new_record(Measured, (target, (p[0] - d[0], p[1] - d[1], p[2] - d[2]), timing, age_s))
 
     def settle(self, step: FlownStep, measured: Measured, state_s: float) -> Finding | None:
         """Records and judges a step; what is to be done about it.
@@ -146,9 +146,9 @@ class Accounting:
         target, error, timing, age_s = measured
         shown_s = step.track_s if step.phase is Phase.TRACK else math.nan
         self._record.append(control_row(shown_s, step.phase, step.state, target, error, step.out, timing))
-        paced = self._peer.paced
-        seen = Seen(step.state, error, step.out, step.skipped, timing.late, age_s, step.arrival_ns, paced)
-        return self._watch.on_step(seen, step.course, state_s)
+        state, out, course, _, _, _, skipped, arrival_ns = step
+        seen = new_record(Seen, (state, error, out, skipped, timing.late, age_s, arrival_ns, self._peer.paced))
+        return self._watch.on_step(seen, course, state_s)
 
     def show(self, step: FlownStep, measured: Measured, sent_ns: int) -> bool:
         """Shows people how the flight stands, when it is time for that. Returns whether it was."""

@@ -15,7 +15,7 @@ import struct
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, Protocol
 
-from companion.control.types import Quat, Vec3
+from companion.control.types import Quat, Vec3, new_record
 
 # Message ids of the messages that this program names itself.
 HEARTBEAT: Final = 0
@@ -32,10 +32,6 @@ AUTOPILOT_VERSION: Final = 148
 STATUSTEXT: Final = 253
 ODOMETRY: Final = 331
 PARAM_ERROR: Final = 345
-
-new_record: Final = tuple.__new__
-"""Makes a NamedTuple of a tuple of all its fields: for what comes with every state, as its own constructor takes three
-times as long."""
 
 MAV_TYPE_ONBOARD_CONTROLLER: Final = 18
 MAV_AUTOPILOT_PX4: Final = 12

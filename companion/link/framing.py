@@ -14,7 +14,8 @@ from typing import Final, NamedTuple, Protocol
 
 from fastcrc.crc16 import mcrf4xx
 
-from companion.link.codec import MessageFormat, new_record
+from companion.control.types import new_record
+from companion.link.codec import MessageFormat
 
 MAGIC_V1: Final = 0xFE
 MAGIC_V2: Final = 0xFD

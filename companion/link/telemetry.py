@@ -11,9 +11,9 @@ import math
 from enum import Enum
 from typing import Final, NamedTuple
 
-from companion.control.types import Quat, Vec3
+from companion.control.types import Quat, Vec3, new_record
 from companion.control.vectors import rotate_to_inertial
-from companion.link.codec import decode_attitude_quaternion, decode_odometry, new_record
+from companion.link.codec import decode_attitude_quaternion, decode_odometry
 from companion.link.framing import Frame
 
 MAV_FRAME_LOCAL_NED: Final = 1
