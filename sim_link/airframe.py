@@ -108,6 +108,8 @@ class Airframe:
         self._thrust_factor = 1.0
         self._rotor_shares: Vec4 = (1.0, 1.0, 1.0, 1.0)
         self._gust_m_s: Vec3 | None = None
+        self._disturbed: tuple[Vec3, Vec3, Vec3] | None = None
+        """Air, force, and the disturbance that they make."""
         self._engine.force_n = world.force_n
         self._engine.air_m_s = self._wind.air_m_s
         self.beliefs = Beliefs(
@@ -208,14 +210,21 @@ class Airframe:
 
     def truth(self) -> Truth:
         """Return the truth now; on the ground the disturbance leaves out what the ground does."""
-        r = self._engine.rigid
+        p, v, q, w, rotor_n = self._engine.rigid
+        return Truth(self.t_us, p, v, q, w, rotor_n, sum(rotor_n), self._disturbance())
+
+    def _disturbance(self) -> Vec3:
+        """Return the disturbance now; the same object as long as nothing changes."""
         air, force, body = self._engine.air_m_s, self._engine.force_n, self._body
-        disturbance = (
-            body.drag_1_s * air[0] + force[0] / body.mass_kg,
-            body.drag_1_s * air[1] + force[1] / body.mass_kg,
-            body.drag_1_s * air[2] + force[2] / body.mass_kg + (body.gravity_m_s2 - STANDARD_GRAVITY_M_S2),
-        )
-        return Truth(self.t_us, r.p, r.v, r.q, r.w, r.rotor_n, sum(r.rotor_n), disturbance)
+        known = self._disturbed
+        if known is None or air is not known[0] or force is not known[1]:
+            disturbance = (
+                body.drag_1_s * air[0] + force[0] / body.mass_kg,
+                body.drag_1_s * air[1] + force[1] / body.mass_kg,
+                body.drag_1_s * air[2] + force[2] / body.mass_kg + (body.gravity_m_s2 - STANDARD_GRAVITY_M_S2),
+            )
+            known = self._disturbed = (air, force, disturbance)
+        return known[2]
 
     def set_wind(self, wind_m_s: Vec3, turbulence: float) -> None:
         """Change the mean wind (NED) in a step, and its turbulence, from now on."""

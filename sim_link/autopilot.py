@@ -319,7 +319,8 @@ class Autopilot:
 
     def update(self, now_us: int, rigid: RigidState, dt_s: float) -> Order:
         """Advance to `now_us`, where the vehicle is in state `rigid`; gives the order for the next dt_s."""
-        self.observe(now_us, rigid)
+        self._now_us = now_us
+        self._rigid = rigid
         if now_us >= self._health_us:
             self._health_us += HEALTH_PERIOD_US
             self._check()
@@ -330,9 +331,9 @@ class Autopilot:
             self._fence_us += FENCE_PERIOD_US
             self._watch_fence(rigid.p)
         order = self._order(rigid, dt_s)
-        self.held = order.setpoint
-        if order.setpoint.mode == ATTITUDE:
-            self.attitude_setpoint = order.setpoint
+        setpoint = self.held = order.setpoint
+        if setpoint.mode == ATTITUDE:
+            self.attitude_setpoint = setpoint
         return order
 
     def observe(self, now_us: int, rigid: RigidState) -> None:

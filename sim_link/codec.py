@@ -47,6 +47,8 @@ SIGNATURE_LENGTH = 13
 AUTOPILOT_COMPONENT = 1
 """MAV_COMP_ID_AUTOPILOT1: what every vehicle's autopilot is."""
 _HEADER = struct.Struct("<BBBBBBBHB")
+_HEADER_AFTER_MAGIC = struct.Struct("<BBBBBBHB")
+_MAGIC_V2_BYTE = bytes((MAGIC_V2,))
 _WHOLE = 12
 """Bytes of a MAVLink 2 frame without its payload."""
 _CHECKED: dict[int, tuple[bytes, int]] = {
@@ -130,13 +132,21 @@ def frames(datagram: bytes) -> list[Frame]:
     found: list[Frame] = []
     at = 0
     end = len(datagram)
-    if end >= _WHOLE and datagram[0] == MAGIC_V2 and datagram[1] + _WHOLE == end and datagram[2] == 0:
-        # Nearly every datagram: one frame of MAVLink 2, not signed. What is wrong with it is sorted out below.
-        _, _, _, _, _, system, component, low, high = _HEADER.unpack_from(datagram)
+    while end - at >= _WHOLE:
+        # Nearly every datagram: frames of MAVLink 2, not signed, one after the other. The rest is sorted out below.
+        magic, length, flags, _, _, system, component, low, high = _HEADER.unpack_from(datagram, at)
+        frame_end = at + length + _WHOLE
+        if magic != MAGIC_V2 or flags != 0 or frame_end > end:
+            break
         msg_id = low | high << 16
         known = _CHECKED.get(msg_id)
-        if known is not None and mcrf4xx(datagram[1:-2] + known[0]) == datagram[-2] | datagram[-1] << 8:
-            return [Frame(msg_id, system, component, datagram[10:-2], datagram)]
+        body_end = frame_end - 2
+        if known is None or mcrf4xx(datagram[at + 1 : body_end] + known[0]) != (
+            datagram[body_end] | datagram[body_end + 1] << 8
+        ):
+            break
+        found.append(Frame(msg_id, system, component, datagram[at + 10 : body_end], datagram[at:frame_end]))
+        at = frame_end
     false_starts = 0
     while at < end and false_starts <= _FALSE_STARTS_MAX:
         start = _MAGIC.search(datagram, at)
@@ -183,8 +193,8 @@ def padded(payload: bytes, size: int) -> bytes:
 
 def attitude_target(payload: bytes) -> AttitudeTarget:
     """Read SET_ATTITUDE_TARGET."""
-    _, w, x, y, z, p, q, r, thrust, system, component, mask, bx, by, bz = SET_ATTITUDE_TARGET.unpack(
-        padded(payload, SET_ATTITUDE_TARGET.size)
+    _, w, x, y, z, p, q, r, thrust, system, component, mask, bx, by, bz = SET_ATTITUDE_TARGET.unpack_from(
+        payload.ljust(SET_ATTITUDE_TARGET.size, b"\0")
     )
     return AttitudeTarget(system, component, mask, (w, x, y, z), (p, q, r), thrust, (bx, by, bz))
 
@@ -197,7 +207,7 @@ def actuator_controls(payload: bytes) -> ActuatorControls:
 
 def timesync(payload: bytes) -> tuple[int, int]:
     """Read TIMESYNC: (tc1, ts1) [ns]."""
-    tc1, ts1, _, _ = TIMESYNC.unpack(padded(payload, TIMESYNC.size))
+    tc1, ts1, _, _ = TIMESYNC.unpack_from(payload.ljust(TIMESYNC.size, b"\0"))
     return tc1, ts1
 
 
@@ -226,17 +236,19 @@ class Encoder:
 
     def hot(self, msg_id: int, payload: bytes) -> bytes:
         """Frame a payload packed with one of the structs above."""
-        crc_extra = _CHECKED[msg_id][0]
         body = payload.rstrip(b"\0") or payload[:1]
         signatures = self._signatures
         signed = signatures is not None and signatures.on
-        head = _HEADER.pack(
-            MAGIC_V2, len(body), signed, 0, self.sequence, self.system, self.component, msg_id & 0xFFFF, msg_id >> 16
+        sequence = self.sequence
+        self.sequence = (sequence + 1) & 0xFF
+        checked = (
+            _HEADER_AFTER_MAGIC.pack(
+                len(body), signed, 0, sequence, self.system, self.component, msg_id & 0xFFFF, msg_id >> 16
+            )
+            + body
         )
-        self.sequence = (self.sequence + 1) & 0xFF
-        head += body
-        head += mcrf4xx(head[1:] + crc_extra).to_bytes(2, "little")
-        return head + signatures.tail(head) if signed and signatures is not None else head
+        frame = _MAGIC_V2_BYTE + checked + mcrf4xx(checked + _CHECKED[msg_id][0]).to_bytes(2, "little")
+        return frame + signatures.tail(frame) if signed and signatures is not None else frame
 
     def cold(self, message: Any) -> bytes:
         """Frame a pymavlink message."""

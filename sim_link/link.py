@@ -111,7 +111,8 @@ class Link:
                 if due_us <= now_us:
                     due_us = now_us + stream.interval_us
                 stream.due_us = due_us
-            next_us = min(next_us, due_us)
+            if due_us < next_us:  # noqa: PLR1730 (not `min`: this is done for every stream of every state)
+                next_us = due_us
         self._next_us = next_us
         return ids
 

@@ -7,8 +7,7 @@ ones pymavlink objects.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from . import codec
@@ -56,15 +55,22 @@ class Telemetry:
     """Builds every message that the vehicle can send from the state of the last tick."""
 
     def __init__(
-        self, vehicle: VehicleFile, autopilot: Autopilot, parameters: Parameters, *, instance: int, now: Estimate
+        self,
+        vehicle: VehicleFile,
+        autopilot: Autopilot,
+        parameters: Parameters,
+        *,
+        instance: int,
+        now: Estimate,
+        rates: Callable[[], Vec3],
     ) -> None:
+        """Begin with an estimate; `rates` gives the body rates that the rate loop follows [rad/s]."""
         self._autopilot = autopilot
         self._parameters = parameters
         self._instance = instance
         self._estimate = now
         self._t_us = now.t_us
-        self.rates: Vec3 = (0.0, 0.0, 0.0)
-        """Body rates that the rate loop follows [rad/s]."""
+        self._rates = rates
         self._covariances = self._pack_covariances(vehicle)
         self.reset_counter = 0
         """Of the estimator: any change tells receivers to start their filters anew."""
@@ -85,21 +91,19 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self.autopilot_version,
         }
 
-    def update(self, t_us: int, estimate: Estimate, rates: Vec3) -> None:
-        """Take over the state of a tick; `rates`: the body rates that the rate loop follows [rad/s]."""
+    def update(self, t_us: int, estimate: Estimate) -> None:
+        """Take over the state of a tick."""
         self._t_us = t_us
         self._estimate = estimate
-        self.rates = rates
 
-    @contextmanager
-    def at(self, t_us: int, estimate: Estimate) -> Iterator[None]:
-        """Build messages of another time for a moment."""
-        now = self._t_us, self._estimate
+    def build_ahead(self, t_us: int, estimate: Estimate, ids: Iterable[int]) -> list[tuple[int, Payload | None]]:
+        """Build messages of another time, but for TIMESYNC; what is told of the present stays as it is."""
+        now_us, now = self._t_us, self._estimate
         self._t_us, self._estimate = t_us, estimate
         try:
-            yield
+            return [(msg_id, self.build(msg_id)) for msg_id in ids if msg_id != codec.ID_TIMESYNC]
         finally:
-            self._t_us, self._estimate = now
+            self._t_us, self._estimate = now_us, now
 
     @property
     def sample_us(self) -> int:
@@ -195,8 +199,8 @@ class Telemetry:
         if last is None:
             if not self._autopilot.armed:
                 return None
-            return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, 0.0, 0.0, 0.0, 0.0, *self.rates, 0.0, 0)
-        return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, *last.q, *self.rates, abs(last.thrust), 0)
+            return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, 0.0, 0.0, 0.0, 0.0, *self._rates(), 0.0, 0)
+        return codec.ATTITUDE_TARGET.pack(self._t_us // 1000, *last.q, *self._rates(), abs(last.thrust), 0)
 
     def heartbeat(self) -> Any:
         """HEARTBEAT."""

@@ -95,8 +95,9 @@ class MissionProtocol:
 
     def update(self, now_us: int) -> None:
         """Ask again for what did not come, and give up what takes too long."""
+        idle = _State.IDLE
         for transfer in self._transfers:
-            if transfer.state is _State.IDLE:
+            if transfer.state is idle:
                 continue
             if now_us - transfer.heard_us > TIMEOUT_US:
                 self._say(mavlink.MAV_SEVERITY_CRITICAL, "Operation timeout")

@@ -281,14 +281,15 @@ class Offboard:
         if now_us - self._evaluated_us >= _REEVALUATION_US:
             self.evaluate(now_us)
 
-    def order(self, now_us: int, held: Setpoint) -> Order:
-        """Give the setpoint for the next tick; `held`: what the loops follow already, and go on with when nothing came.
+    def order(self, held: Setpoint) -> Order:
+        """Give the setpoint for the next tick, for which it is chosen (`choose`) who is in charge.
+
+        `held` is what the loops follow already, and go on with when nothing came.
 
         A setpoint is held until it is replaced. One of another type than the controller in charge is either not looked
         at (rates are followed, an attitude comes) or overwritten at once by the controller in charge (an attitude is
         followed, rates come: mask 0, or the time until the next evaluation).
         """
-        self.choose(now_us)
         glimpse: Setpoint | None = None
         setpoint, fresh = self._rates, self._rates_fresh
         if self._follows == ATTITUDE:

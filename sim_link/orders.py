@@ -89,7 +89,7 @@ class Orders:
             self._offboard.choose(now_us)
             if self._offboard.follows_trajectory:
                 return self._trajectory(now_us, rigid, dt_s, held, spooled_up)
-            order = self._offboard.order(now_us, held)
+            order = self._offboard.order(held)
         elif mode in _RATE_OR_LEVEL:
             return self._stick_order(mode, now_us, rigid, dt_s)
         elif self._stays_on_ground(spooled_up):

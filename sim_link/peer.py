@@ -115,6 +115,7 @@ class Peer:
         self.synchronous = options.lockstep
         """Whether the clock waits for the companion; False while a silent one lets it run at real time."""
         vehicle.asks_time = not options.lockstep
+        vehicle.tells_truth = options.truth_port is not None
         vehicle.faults.tell = notice
         if options.lockstep:
             vehicle.faults.effects.set_lockstep()

@@ -190,6 +190,8 @@ class Vehicle:
         """HIL_STATE_QUATERNION frames with the truth."""
         self.asks_time = True
         """Whether TIMESYNC requests go out with the other messages (in lockstep the peer asks after each state)."""
+        self.tells_truth = True
+        """Whether anybody wants what gathers in `truth_outbox`."""
         self._foretold: Foretold | None = None
         self._told_ahead_us = -1
         """Vehicle time of the last state whose messages went out before its `tick`."""
@@ -214,7 +216,14 @@ class Vehicle:
             home=home,
             plans=plans,
         )
-        self.telemetry = Telemetry(file, self.autopilot, self.parameters, instance=options.instance, now=believed)
+        self.telemetry = Telemetry(
+            file,
+            self.autopilot,
+            self.parameters,
+            instance=options.instance,
+            now=believed,
+            rates=self.airframe.rates_followed,
+        )
         self.slow = SlowTelemetry(file, self.autopilot, self.parameters, now=believed, rigid=rigid, seed=options.seed)
         self.telemetry.add(self.slow.builders)
         self.services = Services(
@@ -282,36 +291,35 @@ class Vehicle:
                 return
         if airframe.beliefs.version != self._beliefs_version:
             self._obey_beliefs()
-        now_us = self.t_us + self.period_us
-        due = [link.due(now_us, self.period_us) for link in self.links]
-        early = self.steps_per_tick <= airframe.age_steps and self._tell_the_past(due)
+        telemetry, period_us, left = self.telemetry, self.period_us, self.steps_per_tick
+        now_us = airframe.t_us - self._boot_us + period_us
+        due = [link.due(now_us, period_us) for link in self.links]
+        early = left <= airframe.age_steps and self._tell_the_past(due)
         if early:
-            believed = self._dated(airframe.believed(self.steps_per_tick))
-            self.telemetry.update(now_us, believed, self.telemetry.rates)
             if self._told_ahead_us != now_us:
+                telemetry.update(now_us, self._dated(airframe.believed(left)))
                 self._publish(due, now_us)
             queued(now_us)
-        left = self.steps_per_tick
         while left > 0:
             order, steps = self._decide(left)
             self._move(order, steps)
             left -= steps
         believed = self._dated(airframe.believed())
-        self.telemetry.update(now_us, believed, airframe.rates_followed())
+        telemetry.update(now_us, believed)
         if self.slow.update(now_us, believed, airframe.rigid):
             airframe.set_thrust_factor(self.slow.battery.thrust_factor)
         self.services.update(self.links, now_us)
         if not early:
             self._publish(due, now_us)
             queued(now_us)
-        if now_us >= self._truth_us:
+        if self.tells_truth and now_us >= self._truth_us:
             self._publish_truth(now_us)
 
     def _wait_for_boot(self, queued: Callable[[int], None]) -> None:
         """Advance by one state period while the autopilot is down; vehicle time is that of before still."""
         self.airframe.advance(STOPPED_SETPOINT, True, self.steps_per_tick)
         queued(self.t_us)
-        if self.t_us >= self._truth_us:
+        if self.tells_truth and self.t_us >= self._truth_us:
             self._publish_truth(self.t_us)
 
     def look_ahead(self) -> None:
@@ -320,10 +328,11 @@ class Vehicle:
         if self.steps_per_tick > self.airframe.age_steps:
             return
         estimate = self.airframe.believed(self.steps_per_tick)
-        now_us = self.t_us + self.period_us
-        if self._undisturbed():
-            ids, *others = [link.due_without_fail(now_us, self.period_us) for link in self.links]
-            if ids is not None and all(none == [] for none in others) and _OF_THE_PAST.issuperset(ids):
+        if not self.asks_time and self._undisturbed():
+            now_us = self.t_us + self.period_us
+            ids = self.companion.due_without_fail(now_us, self.period_us)
+            others = self.ground.due_without_fail(now_us, self.period_us)
+            if ids is not None and others is not None and not others and _OF_THE_PAST.issuperset(ids):
                 self._foretold = self._foretell(ids, estimate, now_us)
 
     def _undisturbed(self) -> bool:
@@ -340,11 +349,12 @@ class Vehicle:
 
     def _foretell(self, ids: Sequence[int], estimate: Estimate, now_us: int) -> Foretold | None:
         """Build the messages of the next state; what is told to whoever asks before it stays as it is."""
-        telemetry = self.telemetry
-        with telemetry.at(now_us, self._dated(estimate)):
-            contents = [(msg_id, telemetry.build(msg_id)) for msg_id in ids if msg_id != ID_TIMESYNC]
-        packed = [(msg_id, content) for msg_id, content in contents if isinstance(content, bytes)]
-        return Foretold(now_us, packed) if len(packed) == len(contents) and not self.asks_time else None
+        packed = []
+        for msg_id, content in self.telemetry.build_ahead(now_us, self._dated(estimate), ids):
+            if not isinstance(content, bytes):
+                return None
+            packed.append((msg_id, content))
+        return Foretold(now_us, packed)
 
     def tell_ahead(self) -> int | None:
         """Queue the messages of the next state now, if nothing that may still happen before it can change them.
@@ -368,15 +378,27 @@ class Vehicle:
 
     def _tell_the_past(self, due: list[Sequence[int]]) -> bool:
         """Tell whether the messages that are due hold nothing of the present motion."""
-        return all(_OF_THE_PAST.issuperset(ids) for ids in due)
+        for ids in due:  # noqa: SIM110 (in the place of `all`: this is asked for every state)
+            if not _OF_THE_PAST.issuperset(ids):
+                return False
+        return True
 
     def _publish(self, due: list[Sequence[int]], now_us: int) -> None:
         """Queue the messages that are due on each link, parameters that were asked for, and texts."""
         if self.airframe.beliefs.active:
             due = self._without_repeats(due)
+        build = self.telemetry.build
         for link, ids in zip(self.links, due, strict=True):
             for msg_id in ids:
-                self._publish_one(link, msg_id, now_us)
+                if msg_id == ID_TIMESYNC:
+                    if self.asks_time:
+                        link.send_hot(msg_id, TIMESYNC.pack(0, now_us * 1000, 0, 0))
+                    continue
+                content = build(msg_id)
+                if isinstance(content, bytes):
+                    link.send_hot(msg_id, content)
+                elif content is not None:
+                    link.send(content)
             if link.parameters_to_send:
                 self.services.send_parameters(link, max(1, _PARAMETERS_PER_S * self.period_us // 1_000_000))
         if self.autopilot.texts:
@@ -400,20 +422,6 @@ class Vehicle:
         """Queue a HEARTBEAT on every link now, whatever its interval."""
         for link in self.links:
             link.send(self.telemetry.heartbeat())
-
-    def _publish_one(self, link: Link, msg_id: int, now_us: int) -> None:
-        """Queue one message of a stream."""
-        if msg_id == ID_TIMESYNC:
-            if self.asks_time:
-                link.send_hot(msg_id, TIMESYNC.pack(0, now_us * 1000, 0, 0))
-            return
-        content = self.telemetry.build(msg_id)
-        if content is None:
-            return
-        if isinstance(content, bytes):
-            link.send_hot(msg_id, content)
-        else:
-            link.send(content)
 
     def _publish_texts(self) -> None:
         """Queue the autopilot's sentences on every link; of too many at once the last are lost, as PX4's are."""
@@ -443,8 +451,9 @@ class Vehicle:
 
         Fewer when a delayed setpoint arrives on the way, or when the autopilot's own period ends.
         """
-        airframe, autopilot, now_us = self.airframe, self.autopilot, self.t_us
-        steps = min(left, self._steps_per_control)
+        airframe, autopilot = self.airframe, self.autopilot
+        now_us = airframe.t_us - self._boot_us
+        steps = left if left < self._steps_per_control else self._steps_per_control
         next_us = autopilot.offboard.next_us
         if next_us is not None and next_us > now_us:
             steps = min(steps, -(-(next_us - now_us) // airframe.dt_us))
@@ -460,7 +469,7 @@ class Vehicle:
             steps -= 1
         if steps > 0:
             airframe.advance(order.setpoint, order.fresh, steps)
-        self.autopilot.observe(self.t_us, airframe.inner_state())
+        self.autopilot.observe(airframe.t_us - self._boot_us, airframe.inner_state())
 
     def _obey_beliefs(self) -> None:
         """Let the autopilot and the messages know what has happened to the estimate."""
