@@ -378,9 +378,9 @@ class Autopilot:
 
     def _follow_mission(self) -> None:
         """Do what the mission wants of the autopilot: home, Return, or Hold at its end."""
-        mission = self.guidance.mission
         if self.mode is not Mode.MISSION:
             return
+        mission = self.guidance.mission
         if mission.home_here:
             mission.home_here = False
             self.set_home(None)

@@ -188,7 +188,8 @@ class CompiledEngine:
         self._blocks = NoiseBlocks(setup.seed)
         self._vehicle = setup.vehicle
         self._set: Setpoint | None = None
-        self._rigid: RigidState | None = setup.rigid
+        self.rigid = setup.rigid
+        """True mechanical state (see Engine)."""
         self._last: Estimate | None = None
         self._last_sample = -1
         self.gains = setup.gains
@@ -234,14 +235,6 @@ class CompiledEngine:
         self._put(flat.GAINS, value)
 
     @property
-    def rigid(self) -> RigidState:
-        """True mechanical state."""
-        if self._rigid is None:
-            a, b, c, d, e, f, q0, q1, q2, q3, g, h, i, r0, r1, r2, r3 = _RIGID.unpack_from(self._bytes, 0)
-            self._rigid = RigidState((a, b, c), (d, e, f), (q0, q1, q2, q3), (g, h, i), (r0, r1, r2, r3))
-        return self._rigid
-
-    @property
     def rates(self) -> Vec3:
         """Body rates that the rate loop follows [rad/s]."""
         x, y, z = _VECTOR.unpack_from(self._bytes, _FLOAT_BYTES * (flat.LOOPS + 6))
@@ -267,7 +260,8 @@ class CompiledEngine:
             _ORDER.pack_into(self._bytes, at, mode, thrust, *rates, *q, yaw_rate, *torque, fresh, n_steps)
             self._set = setpoint
         self._run(self._x)
-        self._rigid = None
+        a, b, c, d, e, f, q0, q1, q2, q3, g, h, i, r0, r1, r2, r3 = _RIGID.unpack_from(self._bytes, 0)
+        self.rigid = RigidState((a, b, c), (d, e, f), (q0, q1, q2, q3), (g, h, i), (r0, r1, r2, r3))
         self._sample += n_steps
         self._row = (self._row + n_steps) % self._ring_rows
 

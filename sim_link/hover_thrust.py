@@ -56,8 +56,10 @@ class HoverThrust:
     @property
     def value(self) -> float | None:
         """The estimate, as a share of the collective thrust; None: none is valid, or it is not to be used."""
+        if not self._valid:
+            return None
         unused = "MPC_USE_HTE" in self._parameters and self._parameters.integer("MPC_USE_HTE") == 0
-        return self._share if self._valid and not unused else None
+        return None if unused else self._share
 
     def shift(self, dp_m: Vec3, dv_m_s: Vec3) -> None:
         """Take note that the estimate of position and velocity has jumped: that is no acceleration."""

@@ -64,9 +64,10 @@ class LandDetector:
             self._since_us = [None, None, None]
             return
         self.ground_contact = self._hold(0, self._touches(motion), self.ground_contact, now_us)
-        still = math.hypot(*motion.w) < _ROTATION_MAX_RAD_S
         falling = self._falls(motion, now_us)
-        maybe = self.ground_contact and self._idles(motion) and still and not falling
+        maybe = (
+            self.ground_contact and self._idles(motion) and math.hypot(*motion.w) < _ROTATION_MAX_RAD_S and not falling
+        )
         self.maybe_landed = self._hold(1, maybe, self.maybe_landed, now_us)
         self.landed = self._hold(2, self.maybe_landed, self.landed, now_us)
 

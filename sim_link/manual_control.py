@@ -106,6 +106,8 @@ class ManualInput:
 
     def _chosen(self, now_us: int) -> _Source | None:
         """Give the source that COM_RC_IN_MODE puts first among those that are there."""
+        if self._joystick.sticks is None and self._radio.sticks is None:
+            return None
         mode = self._parameters.integer("COM_RC_IN_MODE")
         order = [self._joystick, self._radio] if mode in _JOYSTICK_FIRST_MODES else [self._radio, self._joystick]
         for source in order:

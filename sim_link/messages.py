@@ -76,7 +76,7 @@ class Telemetry:
         """Of the estimator: any change tells receivers to start their filters anew."""
         self.stamp_shift_us = 0
         """Added to the stamps of state messages that are stamped with the time of publication."""
-        self._builders: dict[int, Callable[[], Payload | None]] = {
+        self.builders: dict[int, Callable[[], Payload | None]] = {
             codec.ID_HEARTBEAT: self.heartbeat,
             codec.ID_ODOMETRY: self.odometry,
             codec.ID_ATTITUDE_QUATERNION: self.attitude_quaternion,
@@ -90,6 +90,7 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_CURRENT_MODE: self.current_mode,
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self.autopilot_version,
         }
+        """What builds each message that there is (see `build`)."""
 
     def update(self, t_us: int, estimate: Estimate) -> None:
         """Take over the state of a tick."""
@@ -116,15 +117,15 @@ class Telemetry:
 
     def add(self, builders: Mapping[int, Callable[[], Payload | None]]) -> None:
         """Take in messages that are built elsewhere."""
-        self._builders.update(builders)
+        self.builders.update(builders)
 
     def knows(self, msg_id: int) -> bool:
         """Tell whether the vehicle has such a message."""
-        return msg_id in self._builders
+        return msg_id in self.builders
 
     def build(self, msg_id: int) -> Payload | None:
         """Build a message: packed payload or pymavlink object; None: unknown, or there is no data for it yet."""
-        builder = self._builders.get(msg_id)
+        builder = self.builders.get(msg_id)
         return None if builder is None else builder()
 
     @staticmethod
@@ -317,9 +318,13 @@ def euler(q: tuple[float, float, float, float]) -> Vec3:
 
 def _int16(value: float) -> int:
     """Round to what an int16 field holds; NaN becomes 0."""
+    if -32768.0 <= value <= 32767.0:
+        return round(value)
     return round(min(32767.0, max(-32768.0, value))) if not math.isnan(value) else 0
 
 
 def _int32(value: float) -> int:
     """Round to what an int32 field holds; NaN becomes 0."""
+    if -2147483648.0 <= value <= 2147483647.0:
+        return round(value)
     return round(min(2147483647.0, max(-2147483648.0, value))) if not math.isnan(value) else 0

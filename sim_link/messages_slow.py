@@ -7,7 +7,9 @@ own wire order (`unpacker`).
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 from .autopilot import Autopilot
@@ -333,8 +335,13 @@ class SlowTelemetry:
 
 def _pack(name: str, *fields: float) -> bytes:
     """Pack a payload; fields in wire order."""
-    cls = getattr(mavlink, f"MAVLink_{name.lower()}_message")
-    return bytes(cls.unpacker.pack(*fields))
+    return _layout(name).pack(*fields)
+
+
+@cache
+def _layout(name: str) -> struct.Struct:
+    """Give the wire format of a message's payload."""
+    return struct.Struct(getattr(mavlink, f"MAVLink_{name.lower()}_message").unpacker.format)
 
 
 def _or_zero(value: float) -> float:
@@ -343,6 +350,8 @@ def _or_zero(value: float) -> float:
 
 def _whole(value: float, low: int, high: int) -> int:
     """Round to a range; NaN becomes the nearest to 0."""
+    if low <= value <= high:
+        return round(value)
     if math.isnan(value):
         value = 0.0
     return round(min(float(high), max(float(low), value)))

@@ -172,10 +172,11 @@ class Peer:
         vehicle.tick(self._send_state)
         if vehicle.truth_outbox:
             self._flush()
-        for link in vehicle.links:
-            if link.faults is not None:
-                for frame in link.faults.released():
-                    self._obey(frame, link)
+        if vehicle.companion.faults is not None or vehicle.ground.faults is not None:
+            for link in vehicle.links:
+                if link.faults is not None:
+                    for frame in link.faults.released():
+                        self._obey(frame, link)
         # The companion is at work now: what else there is to do costs nobody any time.
         vehicle.look_ahead()
         self._refill()
@@ -463,18 +464,21 @@ class Peer:
     def _flush(self) -> None:
         """Send what waits in the outboxes."""
         vehicle = self.vehicle
-        for link in vehicle.links:
-            if link.faults is not None:
-                link.faults.outgoing(link.outbox)
-                self.companion.together = False  # what is wrong with one frame must not reach another
-        if vehicle.companion.outbox:
-            self.companion.send(vehicle.companion.outbox)
-        if self.ground is not None:
-            if vehicle.ground.outbox:
-                self.ground.send(vehicle.ground.outbox)
-        else:
-            vehicle.ground.outbox.clear()
-        if self._truth is not None and vehicle.truth_outbox:
-            self._truth.send(vehicle.truth_outbox)
-        else:
-            vehicle.truth_outbox.clear()
+        companion, ground = vehicle.companion, vehicle.ground
+        if companion.faults is not None or ground.faults is not None:
+            for link in vehicle.links:
+                if link.faults is not None:
+                    link.faults.outgoing(link.outbox)
+            self.companion.together = False  # what is wrong with one frame must not reach another
+        if companion.outbox:
+            self.companion.send(companion.outbox)
+        if ground.outbox:
+            if self.ground is not None:
+                self.ground.send(ground.outbox)
+            else:
+                ground.outbox.clear()
+        if vehicle.truth_outbox:
+            if self._truth is not None:
+                self._truth.send(vehicle.truth_outbox)
+            else:
+                vehicle.truth_outbox.clear()

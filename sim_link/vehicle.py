@@ -293,7 +293,7 @@ class Vehicle:
             self._obey_beliefs()
         telemetry, period_us, left = self.telemetry, self.period_us, self.steps_per_tick
         now_us = airframe.t_us - self._boot_us + period_us
-        due = [link.due(now_us, period_us) for link in self.links]
+        due = [self.companion.due(now_us, period_us), self.ground.due(now_us, period_us)]
         early = left <= airframe.age_steps and self._tell_the_past(due)
         if early:
             if self._told_ahead_us != now_us:
@@ -387,18 +387,19 @@ class Vehicle:
         """Queue the messages that are due on each link, parameters that were asked for, and texts."""
         if self.airframe.beliefs.active:
             due = self._without_repeats(due)
-        build = self.telemetry.build
+        builders = self.telemetry.builders
         for link, ids in zip(self.links, due, strict=True):
+            frame, queue = link.encoder.hot, link.outbox.append
             for msg_id in ids:
                 if msg_id == ID_TIMESYNC:
                     if self.asks_time:
-                        link.send_hot(msg_id, TIMESYNC.pack(0, now_us * 1000, 0, 0))
-                    continue
-                content = build(msg_id)
-                if isinstance(content, bytes):
-                    link.send_hot(msg_id, content)
-                elif content is not None:
-                    link.send(content)
+                        queue(frame(msg_id, TIMESYNC.pack(0, now_us * 1000, 0, 0)))
+                elif msg_id in builders:
+                    content = builders[msg_id]()
+                    if isinstance(content, bytes):
+                        queue(frame(msg_id, content))
+                    elif content is not None:
+                        link.send(content)
             if link.parameters_to_send:
                 self.services.send_parameters(link, max(1, _PARAMETERS_PER_S * self.period_us // 1_000_000))
         if self.autopilot.texts:

@@ -560,7 +560,7 @@ def test_every_message_can_be_built_with_bad_numbers_and_in_an_outage() -> None:
         v.airframe.beliefs.set_bad_numbers(kind)
         v.airframe.beliefs.set_outage(kind is None)
         run(v, 0.1)
-        for msg_id in list(v.telemetry._builders):
+        for msg_id in list(v.telemetry.builders):
             content = v.telemetry.build(msg_id)
             assert content is None or isinstance(content, bytes) or content.pack(v.companion.encoder._mav)
 
