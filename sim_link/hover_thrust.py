@@ -46,6 +46,8 @@ class HoverThrust:
         self._valid = False
         self._before: tuple[int, float] | None = None
         """Time [us] and vertical speed of the last call."""
+        self._limits = 0.1, 0.9
+        self._limits_version = -1
         self._reset()
 
     def _reset(self) -> None:
@@ -93,27 +95,33 @@ class HoverThrust:
 
     def _fuse(self, up_m_s2: float, thrust: float, scale: float, dt_s: float) -> None:
         """Take in an upward acceleration; `scale` multiplies its variance."""
-        self._variance += _PROCESS_VARIANCE_1_S2 * dt_s * dt_s
-        slope = -_GRAVITY_M_S2 * thrust / (self._share * self._share)
-        error = self._error(up_m_s2, thrust)
-        expected = slope * slope * self._variance + self._noise * scale
-        self._ratio = error * error / (_GATE * _GATE * expected)
+        share, noise = self._share, self._noise
+        variance = self._variance + _PROCESS_VARIANCE_1_S2 * dt_s * dt_s
+        slope = -_GRAVITY_M_S2 * thrust / (share * share)
+        error = up_m_s2 - _GRAVITY_M_S2 * (thrust / share - 1.0)
+        expected = slope * slope * variance + noise * scale
+        ratio = self._ratio = error * error / (_GATE * _GATE * expected)
         left = error
-        if self._ratio < 1.0:
-            gain = self._variance * slope / expected
-            middle = self._parameters.within("MPC_THR_HOVER", 0.1, 0.8)
-            reach = self._parameters.within("HTE_THR_RANGE", 0.0, 1.0)
-            self._share = clip(self._share + gain * error, max(middle - reach, 0.1), min(middle + reach, 0.9))
-            self._variance = clip((1.0 - gain * slope) * self._variance, 1e-10, 1.0)
-            left = self._error(up_m_s2, thrust)
+        if ratio < 1.0:
+            gain = variance * slope / expected
+            share = self._share = clip(share + gain * error, *self._share_range())
+            variance = clip((1.0 - gain * slope) * variance, 1e-10, 1.0)
+            left = up_m_s2 - _GRAVITY_M_S2 * (thrust / share - 1.0)
         elif abs(self._mean_ratio) > _OFFSET_RATIO:
-            self._variance = min(self._variance + 1e3 * _PROCESS_VARIANCE_1_S2 * dt_s, 1.0)
+            variance = min(variance + 1e3 * _PROCESS_VARIANCE_1_S2 * dt_s, 1.0)
+        self._variance = variance
         taken = dt_s / (_BIAS_S + dt_s)
         self._bias += taken * (left - self._bias)
-        self._mean_ratio += taken * (math.copysign(min(self._ratio, 1.0), error) - self._mean_ratio)
-        learned = (left - self._bias) ** 2 + slope * slope * self._variance
-        self._noise += dt_s / (_LEARNING_S + dt_s) * (min(learned, _NOISE_MAX) - self._noise)
-        self._noise = max(self._noise, _NOISE_MIN)
+        self._mean_ratio += taken * (math.copysign(min(ratio, 1.0), error) - self._mean_ratio)
+        learned = (left - self._bias) ** 2 + slope * slope * variance
+        noise += dt_s / (_LEARNING_S + dt_s) * (min(learned, _NOISE_MAX) - noise)
+        self._noise = max(noise, _NOISE_MIN)
 
-    def _error(self, up_m_s2: float, thrust: float) -> float:
-        return up_m_s2 - _GRAVITY_M_S2 * (thrust / self._share - 1.0)
+    def _share_range(self) -> tuple[float, float]:
+        """Give the limits of the estimate."""
+        if self._limits_version != self._parameters.version:
+            self._limits_version = self._parameters.version
+            middle = self._parameters.within("MPC_THR_HOVER", 0.1, 0.8)
+            reach = self._parameters.within("HTE_THR_RANGE", 0.0, 1.0)
+            self._limits = max(middle - reach, 0.1), min(middle + reach, 0.9)
+        return self._limits

@@ -68,19 +68,19 @@ class Intake:
 
         `faults`: what happens to datagrams on their way in.
         """
-        pending = self._pending
+        pending, left = self._pending, self.left
         while not pending:
-            if self.left <= 0:
+            if left <= 0:
                 return None
             datagram = self._endpoint.receive()
             if datagram is None:
                 return None
-            self.left -= 1
+            left = self.left = left - 1
             found, self._sender = datagram
             pending.extend(found if faults is None else faults.incoming(found))
-        if self.left <= 0:
+        if left <= 0:
             return None
-        self.left -= 1
+        self.left = left - 1
         return pending.popleft(), self._sender
 
     def take_pending(self) -> tuple[list[Frame], Address] | None:

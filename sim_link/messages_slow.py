@@ -10,7 +10,7 @@ import math
 import struct
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from .autopilot import Autopilot
 from .battery import CHARGE_LOW, Battery
@@ -53,13 +53,6 @@ _ALL_FIELDS = 0x1FFF
 _UINT16_MAX = 0xFFFF
 
 
-class _Moment(NamedTuple):
-    """The true state at a time."""
-
-    t_us: int
-    rigid: RigidState
-
-
 class SlowTelemetry:
     """Builds the slower messages from the state of the last tick."""
 
@@ -79,7 +72,9 @@ class SlowTelemetry:
         self._vehicle = vehicle
         self._seed = seed
         self._t_us = now.t_us
-        self._now = self._before = _Moment(now.t_us, rigid)
+        self._rigid = self._rigid_before = rigid
+        self._rigid_us = self._rigid_before_us = now.t_us
+        """The true state of this tick and of the one before, and their times."""
         self._battery_us = now.t_us
         self._ping = 0
         self._sample: Sample | None = None
@@ -113,7 +108,8 @@ class SlowTelemetry:
         """Take over the state of a tick; returns whether the battery was looked at."""
         self._t_us, self._estimate = t_us, estimate
         self._sample = None
-        self._before, self._now = self._now, _Moment(t_us, rigid)
+        self._rigid_before, self._rigid_before_us = self._rigid, self._rigid_us
+        self._rigid, self._rigid_us = rigid, t_us
         if t_us - self._battery_us < BATTERY_PERIOD_US:
             return False
         self.battery.update(rigid.rotor_n, self._autopilot.armed, (t_us - self._battery_us) * 1e-6)
@@ -124,18 +120,18 @@ class SlowTelemetry:
     @property
     def _passed_s(self) -> float:
         """Time between the last two ticks; 0 before the first."""
-        return (self._now.t_us - self._before.t_us) * 1e-6
+        return (self._rigid_us - self._rigid_before_us) * 1e-6
 
     def _acceleration(self) -> Vec3:
         """Give the mean acceleration NED [m/s^2] since the tick before."""
         passed_s = self._passed_s
         if passed_s <= 0.0:
             return (0.0, 0.0, 0.0)
-        v, before = self._now.rigid.v, self._before.rigid.v
+        v, before = self._rigid.v, self._rigid_before.v
         return (v[0] - before[0]) / passed_s, (v[1] - before[1]) / passed_s, (v[2] - before[2]) / passed_s
 
     def _pulse_widths(self) -> tuple[int, int, int, int]:
-        before, now = self._before.rigid.rotor_n, self._now.rigid.rotor_n
+        before, now = self._rigid_before.rotor_n, self._rigid.rotor_n
         return pulse_widths(commands(self._vehicle, before, now, self._passed_s), self._autopilot.armed)
 
     # State
@@ -158,7 +154,7 @@ class SlowTelemetry:
         """
         e = self._estimate
         if not self._autopilot.has_estimate:
-            monotonic, none = HOME_ALTITUDE_M - self._now.rigid.p[2], math.nan
+            monotonic, none = HOME_ALTITUDE_M - self._rigid.p[2], math.nan
             return _pack("ALTITUDE", self._t_us, monotonic, none, none, none, HOME_ALTITUDE_M, none)
         amsl = HOME_ALTITUDE_M - e.p[2]
         above_home = self._autopilot.guidance.home[2] - e.p[2]
@@ -166,7 +162,7 @@ class SlowTelemetry:
 
     def gps_raw(self) -> bytes:
         """GPS_RAW_INT: a 3D fix, as good as PX4's simulated receiver."""
-        r = self._now.rigid
+        r = self._rigid
         latitude, longitude, altitude_m = global_position(r.p)
         speed = math.hypot(r.v[0], r.v[1])
         course = math.degrees(math.atan2(r.v[1], r.v[0])) % 360.0 if math.isfinite(speed) else 0.0
@@ -197,7 +193,7 @@ class SlowTelemetry:
     def _measured(self) -> Sample:
         """Give this tick's sample, the same to everybody who asks."""
         if self._sample is None:
-            self._sample = sample(self._seed, self._now.t_us, self._now.rigid, self._acceleration())
+            self._sample = sample(self._seed, self._rigid_us, self._rigid, self._acceleration())
         return self._sample
 
     def highres_imu(self) -> bytes:
@@ -223,7 +219,7 @@ class SlowTelemetry:
 
     def truth(self) -> bytes:
         """HIL_STATE_QUATERNION: what really happens, for who asks for it on a link."""
-        r = self._now.rigid
+        r = self._rigid
         return truth_payload(self._t_us, r.p, r.v, r.q, r.w, self._acceleration())
 
     def vibration(self) -> Any:

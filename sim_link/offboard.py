@@ -277,7 +277,8 @@ class Offboard:
 
     def choose(self, now_us: int) -> None:
         """Look at 2 Hz whether another controller shall be in charge."""
-        self._deliver(now_us)
+        if self._under_way:
+            self._deliver(now_us)
         if now_us - self._evaluated_us >= _REEVALUATION_US:
             self.evaluate(now_us)
 

@@ -86,10 +86,11 @@ class Orders:
             spooled_up: the rotors have turned for COM_SPOOLUP_TIME.
         """
         if mode is Mode.OFFBOARD:
-            self._offboard.choose(now_us)
-            if self._offboard.follows_trajectory:
+            offboard = self._offboard
+            offboard.choose(now_us)
+            if offboard.follows_trajectory:
                 return self._trajectory(now_us, rigid, dt_s, held, spooled_up)
-            order = self._offboard.order(held)
+            order = offboard.order(held)
         elif mode in _RATE_OR_LEVEL:
             return self._stick_order(mode, now_us, rigid, dt_s)
         elif self._stays_on_ground(spooled_up):

@@ -50,9 +50,9 @@ def sample(seed: int, t_us: int, rigid: RigidState, acceleration: Vec3) -> Sampl
     field = rotate_back(rigid.q, FIELD_G)
     pressure = pressure_hpa(HOME_ALTITUDE_M - rigid.p[2]) + _NOISE_HPA * noise[9]
     return Sample(
-        _noisy(force, _NOISE_M_S2, noise[0:3]),
-        _noisy(rigid.w, _NOISE_RAD_S, noise[3:6]),
-        _noisy(field, _NOISE_G, noise[6:9]),
+        _noisy(force, _NOISE_M_S2, noise, 0),
+        _noisy(rigid.w, _NOISE_RAD_S, noise, 3),
+        _noisy(field, _NOISE_G, noise, 6),
         pressure,
         altitude_at_m(pressure),
         _TEMPERATURE_C,
@@ -65,8 +65,9 @@ def _normal_numbers(seed: int, index: int) -> list[float]:
     return [_NORMAL[a + b + c + d] for a, b, c, d in zip(raw[0::4], raw[1::4], raw[2::4], raw[3::4], strict=True)]
 
 
-def _noisy(value: Vec3, sigma: float, noise: list[float]) -> Vec3:
-    return (value[0] + sigma * noise[0], value[1] + sigma * noise[1], value[2] + sigma * noise[2])
+def _noisy(value: Vec3, sigma: float, noise: list[float], at: int) -> Vec3:
+    x, y, z = value
+    return (x + sigma * noise[at], y + sigma * noise[at + 1], z + sigma * noise[at + 2])
 
 
 def pressure_hpa(altitude_m: float) -> float:
