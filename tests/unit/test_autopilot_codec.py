@@ -130,6 +130,23 @@ def test_mavlink_1_and_signed_frames_are_read():
     assert codec.Decoder().message(found[0]).type == 18
 
 
+def test_frames_one_after_the_other_are_read_whatever_stands_between_them():
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+    heartbeat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    plain, version_1 = bytes(heartbeat.pack(mav)), bytes(heartbeat.pack(mav, force_mavlink1=True))
+    mav.signing.secret_key = b"k" * 32
+    mav.signing.sign_outgoing = True
+    signed = bytes(heartbeat.pack(mav))
+    broken = bytes((*plain[:-1], plain[-1] ^ 1))
+    good = (setpoint(7), plain, version_1, signed)
+    for between in (b"", b"\xfd", b"noise", broken, broken + signed[:9]):
+        for first in good:
+            for second in good:
+                found = codec.frames(plain + first + between + second + setpoint(128) + between)
+                assert [f.raw for f in found] == [plain, first, second, setpoint(128)]
+                assert all(f.raw[-2:] == f.raw[10 + len(f.payload) :] for f in found if f.raw in (plain, setpoint(7)))
+
+
 def test_what_is_no_message_is_passed_over():
     good = setpoint(128)
     assert codec.frames(b"") == []

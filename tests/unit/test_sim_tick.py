@@ -10,6 +10,7 @@ import pytest
 from sim_link.autopilot import Result
 from sim_link.codec import (
     ID_ATTITUDE_TARGET,
+    ID_HIL_STATE_QUATERNION,
     ID_ODOMETRY,
     ID_SET_ATTITUDE_TARGET,
     ID_TIMESYNC,
@@ -123,6 +124,34 @@ def test_states_told_before_the_setpoint_is_acted_on_are_the_same() -> None:
     assert none == 0
     assert hurried == usual
     assert hurried_truth == usual_truth
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_truth_is_built_for_its_port_alone(wanted: bool) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ears:
+        ears.bind(("127.0.0.1", 0))
+        ears.settimeout(5.0)
+        v = in_air()
+        built: list[int] = []
+        publish = v._publish_truth
+
+        def noted(now_us: int) -> None:
+            built.append(now_us)
+            publish(now_us)
+
+        v._publish_truth = noted  # type: ignore[method-assign]
+        port = ears.getsockname()[1] if wanted else None
+        peer = Peer(v, PeerOptions(port=0, remote_port=0, truth_port=port, lockstep=True))
+        try:
+            for _ in range(100):
+                peer._advance()
+            assert len(built) == (11 if wanted else 0)
+            assert not v.truth_outbox
+            if wanted:
+                heard = [frame.msg_id for _ in built for frame in frames(ears.recv(2048))]
+                assert heard == [ID_HIL_STATE_QUATERNION] * 11
+        finally:
+            peer.close()
 
 
 def test_polling_in_vain_makes_room_for_the_companion(monkeypatch: pytest.MonkeyPatch) -> None:
