@@ -46,7 +46,7 @@ from companion.link.signing_times import Place
 from companion.link.statustext import StatusTexts
 from companion.link.telemetry import Telemetry
 from companion.record.flight_source import read_source
-from companion.record.tlog import Direction, read_tlog
+from companion.record.tlog import Direction, read_tlog, split_frames
 from companion.record.traffic import Traffic
 from companion.record.ulog_file import read_seldom, read_ulog
 from companion.trajectory.files import Options, shape_of
@@ -410,10 +410,10 @@ def tlog() -> Target:
             entries = list(read_tlog(path))
         traffic = Traffic(lambda *_: None, lambda *_: None, lambda *_: None, 0)
         for number, entry in enumerate(entries):
-            traffic.take(entry.direction, entry.raw, number)
+            traffic.take(entry.direction, split_frames(entry.raw), number)
         for number, piece in enumerate(_pieces(data)):
             raw = _message(piece, _IDS).raw
-            traffic.take(Direction.IN if number % 3 else Direction.OUT, raw, number)
+            traffic.take(Direction.IN if number % 3 else Direction.OUT, split_frames(raw), number)
 
     return run
 

@@ -43,7 +43,7 @@ MAV_MODE_FLAG_SAFETY_ARMED: Final = 128
 _HEARTBEAT = struct.Struct("<IBBBBB")
 COMMAND_LONG_LAYOUT = struct.Struct("<7fHBBB")
 COMMAND_ACK_LAYOUT = struct.Struct("<HBBiBB")
-_TIMESYNC = struct.Struct("<qqBB")
+TIMESYNC_LAYOUT = struct.Struct("<qqBB")
 _ATTITUDE_QUATERNION = struct.Struct("<I7f16x")
 _ODOMETRY = struct.Struct("<Q13f168x4Bb")  # 168: two covariances of 21 floats
 SET_ATTITUDE_TARGET_LAYOUT = struct.Struct("<I4f3ffBBB")
@@ -208,7 +208,7 @@ def message_formats() -> dict[int, MessageFormat]:
     }
     # The target ids of TIMESYNC are an extension (no part of the CRC seed) that pymavlink's definition lacks and
     # PX4's has.
-    formats[TIMESYNC] = MessageFormat(formats[TIMESYNC].crc_extra, _TIMESYNC.size)
+    formats[TIMESYNC] = MessageFormat(formats[TIMESYNC].crc_extra, TIMESYNC_LAYOUT.size)
     return formats
 
 
@@ -257,7 +257,7 @@ def decode_attitude_quaternion(payload: bytes) -> AttitudeQuaternion:
 
 def decode_timesync(payload: bytes) -> Timesync:
     """TIMESYNC."""
-    return new_record(Timesync, _TIMESYNC.unpack_from(filled(payload, _TIMESYNC.size)))
+    return new_record(Timesync, TIMESYNC_LAYOUT.unpack_from(filled(payload, TIMESYNC_LAYOUT.size)))
 
 
 def decode_heartbeat(payload: bytes) -> Heartbeat:
@@ -346,7 +346,7 @@ def encode_set_actuator_control_target(
 
 def encode_timesync(tc1: int, ts1: int, target_system: int = 0, target_component: int = 0) -> bytes:
     """TIMESYNC, times in ns."""
-    return _TIMESYNC.pack(tc1, ts1, target_system, target_component)
+    return TIMESYNC_LAYOUT.pack(tc1, ts1, target_system, target_component)
 
 
 def encode_heartbeat(

@@ -12,14 +12,14 @@ import struct
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
-from operator import itemgetter
 from typing import Any, Final
 
 from companion import __version__
 from companion.frames import wrap_angle, yaw_from_quat
 from companion.record import topics, ulog
 from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES
-from companion.record.tlog import Direction
+from companion.record.rows import RowSeries
+from companion.record.tlog import Direction, split_frames
 from companion.record.traffic import Traffic
 from companion.record.ulog import Level, Number, Series, Topic
 
@@ -29,8 +29,9 @@ _SYNC_US: Final = 1_000_000
 _HELD_TEXTS: Final = 200
 _RELEASE: Final = 255  # FIRMWARE_VERSION_TYPE_OFFICIAL
 _ROW = struct.Struct(f"={len(COLUMNS)}d")
-_T_S, _LYAPUNOV, _HEADING_ERROR = (COLUMN_INDEX[name] for name in ("t_s", "lyapunov", "heading_error_rad"))
-_Q = slice(COLUMN_INDEX["q_w"], COLUMN_INDEX["q_z"] + 1)
+_USED: Final = {"t_s", "q_w", "q_x", "q_y", "q_z", "heading_error_rad"}
+_USED_OF_ROW = struct.Struct("=" + "".join("d" if name in _USED else "8x" for name in COLUMNS))
+_LYAPUNOV: Final = COLUMN_INDEX["lyapunov"]
 _B_HAT = slice(COLUMN_INDEX["b_hat_n"], COLUMN_INDEX["b_hat_d"] + 1)
 
 
@@ -47,8 +48,13 @@ class Entry(IntEnum):
     """The system id of the autopilot that is flown, in one byte."""
 
 
+_KIND_ROW: Final = int(Entry.ROW)  # an IntEnum compares slowly
+_KIND_IN: Final = int(Direction.IN)
+_DIRECTIONS: Final = {int(direction) for direction in Direction}
+
+
 class FlightLog:
-    """The log of one flight. Its methods return what is to be appended to the file.
+    """The log of one flight. `taken` and `end` return what is to be appended to the file.
 
     Args:
         configuration: the text of flight.toml.
@@ -60,7 +66,7 @@ class FlightLog:
         self._settings = _read(configuration)
         self._epoch_minus_wall_ns = epoch_minus_wall_ns
         self._series = {topic.name: Series(topic, number) for number, topic in enumerate(topics.TOPICS)}
-        self._steps = [(self._series[topic.name], _getter(topic)) for topic in topics.STEP_TOPICS]
+        self._rows = RowSeries([self._series[topic.name] for topic in topics.STEP_TOPICS], topics.DERIVED)
         self._traffic = Traffic(self._write, self._say, self._set, epoch_minus_wall_ns)
         self._out: list[bytes] = []
         self._held: list[tuple[int, str]] = []
@@ -72,16 +78,18 @@ class FlightLog:
         self._interval_us = 0
         self._gap = False
 
-    def take(self, kind: int, content: bytes, wall_ns: int) -> bytes:
-        """One entry.
+    def take(self, kind: int, content: bytes, wall_ns: int) -> None:
+        """One entry. Of one that raises only a part, or nothing, is in the log.
 
         Args:
             kind: a `tlog.Direction` or an `Entry`.
             content: the datagram, row or text.
             wall_ns: monotonic time of a datagram.
         """
-        if kind == Entry.ROW:
+        if kind == _KIND_ROW:
             self._take_row(content)
+        elif kind in _DIRECTIONS:
+            self.take_frames(kind, split_frames(content), wall_ns)
         elif kind == Entry.TEXT:
             self._say(content[0], content[1:].decode("utf-8", "replace"))
         elif kind == Entry.FACT:
@@ -89,10 +97,12 @@ class FlightLog:
             self._out.append(ulog.long_info(key, fact))
         elif kind == Entry.SYSTEM:
             self._traffic.follow(content[0])
-        elif kind in {Direction.IN, Direction.OUT}:
-            self._traffic.take(kind, content, wall_ns)
-        self._begin_when_time_is_known(wall_ns)
-        return self._taken()
+
+    def take_frames(self, direction: int, frames: Sequence[bytes], wall_ns: int) -> None:
+        """One datagram, see `Traffic.take`; as `take`."""
+        self._traffic.take(direction, frames, wall_ns)
+        if direction == _KIND_IN:
+            self._begin_when_time_is_known(wall_ns)
 
     def missed(self, count: int) -> None:
         """So many entries, counted from the beginning, did not get here."""
@@ -104,9 +114,10 @@ class FlightLog:
         if not self._begun:
             self._begin(0, 0)
         self._out.append(ulog.sync())
-        return self._taken()
+        return self.taken()
 
-    def _taken(self) -> bytes:
+    def taken(self) -> bytes:
+        """What has been taken since the last call; nothing before the vehicle's time is known."""
         if not self._begun:
             return b""
         out = b"".join(self._out)
@@ -179,15 +190,15 @@ class FlightLog:
             self._held_parameters[name] = value
 
     def _take_row(self, content: bytes) -> None:
-        row = _ROW.unpack(content)
-        t_us = round(row[_T_S] * 1e6)
+        t_s, q_w, q_x, q_y, q_z, heading_error = _USED_OF_ROW.unpack(content)
+        t_us = round(t_s * 1e6)
         self._mark_gap(t_us)
-        yaw = yaw_from_quat(row[_Q]) - row[_HEADING_ERROR]
+        yaw = yaw_from_quat((q_w, q_x, q_y, q_z)) - heading_error
         if self._envelope is None:
+            row = _ROW.unpack(content)
             self._envelope = envelope(self._settings, row[_LYAPUNOV], row[_B_HAT])
-        numbers = (*row, wrap_angle(yaw) if math.isfinite(yaw) else math.nan, self._envelope)
-        for series, values in self._steps:
-            self._out.append(series.encode(t_us, values(numbers)))
+        derived = (wrap_angle(yaw) if math.isfinite(yaw) else math.nan, self._envelope)
+        self._out.append(self._rows.encode(t_us, content, derived))
 
     def _mark_gap(self, t_us: int) -> None:
         """After entries were lost: where rows are missing, for how long."""
@@ -200,12 +211,6 @@ class FlightLog:
             self._out.append(ulog.dropout(1e-3 * passed_us))
         else:
             self._interval_us = passed_us
-
-
-def _getter(topic: Topic) -> itemgetter[Any]:
-    """Takes a step topic's numbers out of a row with the derived numbers behind it."""
-    places = {name: index for index, name in enumerate((*COLUMNS, *topics.DERIVED))}
-    return itemgetter(*[places[name] for field in topic.fields for name in field.columns])
 
 
 def envelope(settings: Mapping[str, Any], value: float, b_hat: Sequence[float]) -> float:

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Final
@@ -29,14 +29,13 @@ from companion.realtime import rejoin
 from companion.record import ring
 from companion.record.flight_log import Entry, FlightLog, Level
 from companion.record.ring import RingReader, RingWriter
-from companion.record.tlog import TLOG_FILE, Direction, encode_datagram
+from companion.record.tlog import TLOG_FILE, Direction, encode_datagrams, split_frames
 from companion.record.ulog import ULOG_FILE
 
 _REPORT = struct.Struct("=QQQ")  # datagrams in link.tlog, datagrams dropped by the child, entries not in flight.ulg
 _READY: Final = b"ready"
 _RING_BYTES: Final = 16 << 20  # a minute and more of a usual link, should the child get no processor
 _PENDING_MAX: Final = 64 << 20  # bytes that wait for a disk that does not answer
-_BATCH: Final = 1 << 16  # bytes of flight.ulg that are handed to the disk at once
 _FLUSH_S: Final = 0.5
 _ROUND_S: Final = 0.05
 _START_TIMEOUT_S: Final = 20.0
@@ -264,6 +263,9 @@ def _write_all(file: int, entries: bytearray) -> None:
         os.fdatasync(file)
 
 
+_Datagram = tuple[int, int, list[bytes]]  # as a `ring.Entry`, with the frames that are in it
+
+
 class _TrafficFile:
     """link.tlog."""
 
@@ -275,14 +277,12 @@ class _TrafficFile:
         """Datagrams in the file."""
         self._epoch_minus_wall_ns = epoch_minus_wall_ns
 
-    def take(self, entry: ring.Entry) -> None:
-        """Writes a datagram."""
-        wall_ns, direction, raw = entry
-        epoch_us = (wall_ns + self._epoch_minus_wall_ns) // 1000
-        if self.writer.put(encode_datagram(raw, epoch_us, direction)):
-            self.taken += 1
+    def take(self, datagrams: Sequence[_Datagram]) -> None:
+        """Hands datagrams to the disk: all of them, or nothing."""
+        if self.writer.put(encode_datagrams(datagrams, self._epoch_minus_wall_ns)):
+            self.taken += len(datagrams)
         else:
-            self.dropped += 1
+            self.dropped += len(datagrams)
 
 
 class _FlightFile:
@@ -293,33 +293,40 @@ class _FlightFile:
         self.missing = 0
         """Entries that are not in the file."""
         self._log = log
-        self._batch: list[bytes] = []
-        self._entries = self._bytes = 0
         self._unreadable = 0
 
-    def take(self, entry: ring.Entry) -> None:
-        """Writes what an entry amounts to."""
-        try:
-            self._add(self._log.take(entry.kind, entry.content, entry.wall_ns))
-        except Exception as error:
-            self.missing += 1
-            self._unreadable += 1
-            if self._unreadable == 1:
-                print(f"{ULOG_FILE}: an entry is left out ({type(error).__name__}: {error})", file=sys.stderr)
+    def take(self, entries: Sequence[ring.Entry]) -> list[_Datagram]:
+        """Hands what entries amount to to the disk: whole messages, or nothing of them.
 
-    def _add(self, content: bytes) -> None:
-        self._batch.append(content)
-        self._entries += 1
-        self._bytes += len(content)
-        if self._bytes > _BATCH:
-            self.flush()
+        Returns:
+            The datagrams among them.
+        """
+        take, take_frames = self._log.take, self._log.take_frames
+        datagrams = []
+        left_out = 0
+        for wall_ns, kind, content in entries:
+            try:
+                if kind in _DIRECTIONS:
+                    frames = split_frames(content)
+                    datagrams.append((wall_ns, kind, frames))
+                    take_frames(kind, frames, wall_ns)
+                else:
+                    take(kind, content, wall_ns)
+            except Exception as error:
+                left_out += 1
+                self._say_once(error)
+        self.missing += left_out
+        self._hand_over(self._log.taken(), len(entries) - left_out)
+        return datagrams
 
-    def flush(self) -> None:
-        """Hands what has gathered to the disk: whole messages, or nothing of them."""
-        if self._bytes and not self.writer.put(b"".join(self._batch)):
-            self.missing += self._entries
-        self._batch.clear()
-        self._entries = self._bytes = 0
+    def _say_once(self, error: Exception) -> None:
+        self._unreadable += 1
+        if self._unreadable == 1:
+            print(f"{ULOG_FILE}: an entry is left out ({type(error).__name__}: {error})", file=sys.stderr)
+
+    def _hand_over(self, content: bytes, count: int) -> None:
+        if content and not self.writer.put(content):
+            self.missing += count
 
     def refused(self, count: int) -> None:
         """So many entries found no room in the ring."""
@@ -327,8 +334,7 @@ class _FlightFile:
 
     def end(self) -> None:
         """The end of the flight."""
-        self._add(self._log.end())
-        self.flush()
+        self._hand_over(self._log.end(), 1)
 
 
 def _receive(link: socket.socket, reader: RingReader, traffic: _TrafficFile, flight: _FlightFile) -> None:
@@ -338,12 +344,9 @@ def _receive(link: socket.socket, reader: RingReader, traffic: _TrafficFile, fli
     control process less.
     """
 
-    def write(entries: Iterable[ring.Entry]) -> None:
-        for entry in entries:
-            if entry.kind in _DIRECTIONS:
-                traffic.take(entry)
-            flight.take(entry)
-        flight.flush()
+    def write(batches: Iterator[list[ring.Entry]]) -> None:
+        for batch in batches:
+            traffic.take(flight.take(batch))
         flight.refused(reader.refused)
 
     while not select.select([link], [], [], _ROUND_S)[0]:

@@ -17,7 +17,7 @@ import os
 import struct
 import tempfile
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 _ENTRY = struct.Struct("=qIB")  # wall_ns, length, kind
 _HEAD: Final = _ENTRY.size
@@ -26,16 +26,14 @@ _USUAL_BYTES: Final = 640
 _PACK: Final = tuple(struct.Struct(f"{_ENTRY.format}{length}s").pack_into for length in range(_USUAL_BYTES))
 _SKIP: Final = 0xFFFFFFFF
 """A length that says: the next entry is at the beginning again."""
+_BATCH: Final = 256
+"""Entries that are taken at once, at most: some 60 kB of a usual link."""
 _HEAD_BYTES: Final = 64
 _WRITTEN, _READ, _TAKEN, _REFUSED, _PATIENT = 0, 1, 2, 3, 4  # the head's numbers, of 8 bytes each
 
 
-class Entry(NamedTuple):
-    """What was handed over."""
-
-    wall_ns: int
-    kind: int
-    content: bytes
+Entry = tuple[int, int, bytes]
+"""What was handed over: wall_ns, kind, content."""
 
 
 def create(size_bytes: int) -> int:
@@ -165,30 +163,39 @@ class RingReader(_Ring):
         numbers = self._numbers
         return bool(numbers[_PATIENT]) and 2 * (numbers[_WRITTEN] - numbers[_READ]) < self._size
 
-    def take(self) -> Iterator[Entry]:
-        """The entries that were there at the last look already."""
+    def take(self) -> Iterator[list[Entry]]:
+        """The entries that were there at the last look already, some hundred at a time."""
         limit, self._seen = self._seen, self._numbers[_WRITTEN]
         return self._take_until(limit)
 
-    def take_rest(self) -> Iterator[Entry]:
+    def take_rest(self) -> Iterator[list[Entry]]:
         """Everything: the writer has ended."""
         self._seen = self._numbers[_WRITTEN]
         return self._take_until(self._seen)
 
-    def _take_until(self, limit: int) -> Iterator[Entry]:
+    def _take_until(self, limit: int) -> Iterator[list[Entry]]:
         while self._done < limit:
-            at = self._done % self._size
-            left = self._size - at
+            yield self._take_batch(limit)
+
+    def _take_batch(self, limit: int) -> list[Entry]:
+        """Copies entries out, and gives their room back."""
+        memory, size, head_of = self._map, self._size, _ENTRY.unpack_from
+        entries: list[Entry] = []
+        done = self._done
+        while done < limit and len(entries) < _BATCH:
+            at = done % size
+            left = size - at
             if left < _HEAD:
-                self._done += left
+                done += left
                 continue
-            wall_ns, length, kind = _ENTRY.unpack_from(self._bytes, at)
+            at += _HEAD_BYTES
+            wall_ns, length, kind = head_of(memory, at)
             if length == _SKIP:
-                self._done += left
+                done += left
                 continue
-            begin = at + _HEAD
-            entry = Entry(wall_ns, kind, bytes(self._bytes[begin : begin + length]))
-            self._done += _HEAD + length
-            self._numbers[_READ] = self._done
-            self._numbers[_TAKEN] += 1
-            yield entry
+            at += _HEAD
+            entries.append((wall_ns, kind, memory[at : at + length]))
+            done += _HEAD + length
+        self._done = self._numbers[_READ] = done
+        self._numbers[_TAKEN] += len(entries)
+        return entries

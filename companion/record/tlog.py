@@ -7,7 +7,7 @@ and pymavlink reads them: 0 for what came in, 3 for what went out.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -57,11 +57,16 @@ def frame_length(header: bytes) -> int:
 
 def split_frames(datagram: bytes) -> list[bytes]:
     """The whole frames in a datagram, by their lengths; the rest is left out, or readers would lose their place."""
+    end = len(datagram)
+    if end > _HEADER and datagram[0] == _MAGIC_V2 and datagram[1] == end - _OVERHEAD_V2 and not datagram[2] & _SIGNED:
+        return [datagram]  # as most are
     frames = []
     at = 0
-    end = len(datagram)
     while at + _OVERHEAD_V1 <= end:
-        length = frame_length(datagram[at : at + _HEADER])
+        if datagram[at] == _MAGIC_V2 and not datagram[at + 2] & _SIGNED:  # as `frame_length`, at half its price
+            length = _OVERHEAD_V2 + datagram[at + 1]
+        else:
+            length = frame_length(datagram[at : at + _HEADER])
         if length and at + length <= end:
             frames.append(datagram[at : at + length])
             at += length
@@ -70,16 +75,20 @@ def split_frames(datagram: bytes) -> list[bytes]:
     return frames
 
 
-def encode_datagram(datagram: bytes, epoch_us: int, direction: int) -> bytes:
-    """The entries of a datagram's frames, all with the same stamp; empty when there is no frame in it.
+def encode_datagrams(datagrams: Iterable[tuple[int, int, Sequence[bytes]]], epoch_minus_wall_ns: int) -> bytes:
+    """The entries of datagrams' frames: those of one all with the same stamp, nothing for one without a frame.
 
     Args:
-        datagram: what was received or sent.
-        epoch_us: microseconds since the epoch; the lowest two bits give way to the direction.
-        direction: a `Direction`.
+        datagrams: of each when it came or went [ns], a `Direction`, and its frames, see `split_frames`.
+        epoch_minus_wall_ns: turns these times into nanoseconds since the epoch. In microseconds, the lowest two bits
+            give way to the direction.
     """
-    stamp = _STAMP.pack((epoch_us & ~_LINK_BITS) | direction)
-    return b"".join(stamp + frame for frame in split_frames(datagram))
+    parts: list[bytes] = []
+    for wall_ns, direction, frames in datagrams:
+        stamp = _STAMP.pack(((wall_ns + epoch_minus_wall_ns) // 1000 & ~_LINK_BITS) | direction)
+        for frame in frames:
+            parts += (stamp, frame)
+    return b"".join(parts)
 
 
 def read_tlog(path: Path) -> Iterator[LoggedFrame]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from companion.frames import yaw_from_quat
 from companion.link import codec
@@ -18,11 +18,12 @@ from companion.link.modes import AutoMode, MainMode, Mode
 from companion.link.statustext import StatusTexts
 from companion.link.telemetry import StateRejection, Telemetry
 from companion.record import topics
-from companion.record.tlog import Direction, split_frames
+from companion.record.tlog import Direction
 from companion.record.ulog import Level, Number, Topic
 
 Write = Callable[[Topic, int, Sequence[Number]], None]
 """Takes a topic, vehicle time [us] and the numbers."""
+Handler = TypeVar("Handler")
 Say = Callable[[int, str], None]
 """Takes a severity and a text."""
 
@@ -47,6 +48,10 @@ NAV_STATES: Final[dict[Mode, int]] = {
 """PX4's nav_state of a mode as the link names it."""
 ROTARY_WINGS: Final = {2, 3, 4, 13, 14, 15}  # MAV_TYPE: quadrotor, coaxial, helicopter, hexa-, octo-, tricopter
 
+_OUT: Final = int(Direction.OUT)
+_V2: Final = 0xFD  # the first byte of a frame of MAVLink 2
+_PAYLOAD_V2: Final = 10  # where its payload begins
+_HIGH: Final = bytes(2)  # the rest of a message's id that MAVLink 1 does not have
 _SECOND_US: Final = 1_000_000
 _FAR_US: Final = 10_000_000
 _LOSS_MAX: Final = 128  # a larger step of the sequence number is a late frame, or a restarted sender
@@ -90,55 +95,66 @@ class Traffic:
         self._bytes_in = self._bytes_out = 0
         self._told_us: int | None = None
         self._told_bytes = (0, 0)
-        self._on_in: dict[int, Callable[[Frame], None]] = {
-            codec.HEARTBEAT: self._on_heartbeat,
-            codec.ODOMETRY: self._on_odometry,
-            codec.TIMESYNC: self._on_timesync,
-            codec.STATUSTEXT: self._on_statustext,
-            codec.PARAM_VALUE: self._on_param_value,
-            CURRENT_MODE: self._on_current_mode,
-            EXTENDED_SYS_STATE: self._on_extended_sys_state,
-            BATTERY_STATUS: self._on_battery_status,
-            HOME_POSITION: self._on_home_position,
-        }
-        self._on_out: dict[int, Callable[[bytes], None]] = {
-            codec.SET_ATTITUDE_TARGET: self._on_attitude_target,
-            codec.SET_POSITION_TARGET_LOCAL_NED: self._on_position_target,
-            codec.SET_ACTUATOR_CONTROL_TARGET: self._on_actuator_target,
-        }
+        self._on_in: dict[bytes, Callable[[bytes, int], None]] = _by_id(
+            {
+                codec.ODOMETRY: self._on_odometry,
+                codec.TIMESYNC: self._on_timesync,
+            }
+        )
+        self._on_seldom: dict[bytes, Callable[[Frame], None]] = _by_id(
+            {
+                codec.HEARTBEAT: self._on_heartbeat,
+                codec.STATUSTEXT: self._on_statustext,
+                codec.PARAM_VALUE: self._on_param_value,
+                CURRENT_MODE: self._on_current_mode,
+                EXTENDED_SYS_STATE: self._on_extended_sys_state,
+                BATTERY_STATUS: self._on_battery_status,
+                HOME_POSITION: self._on_home_position,
+            }
+        )
+        self._on_out: dict[bytes, Callable[[bytes], None]] = _by_id(
+            {
+                codec.SET_ATTITUDE_TARGET: self._on_attitude_target,
+                codec.SET_POSITION_TARGET_LOCAL_NED: self._on_position_target,
+                codec.SET_ACTUATOR_CONTROL_TARGET: self._on_actuator_target,
+            }
+        )
 
-    def take(self, direction: int, datagram: bytes, wall_ns: int) -> None:
+    def take(self, direction: int, frames: Sequence[bytes], wall_ns: int) -> None:
         """One datagram.
 
         Args:
             direction: a `tlog.Direction`.
-            datagram: the frames.
+            frames: what is in it, see `tlog.split_frames`.
             wall_ns: monotonic time at which they came or went.
         """
-        for raw in split_frames(datagram):
-            if direction == Direction.OUT:
+        if direction == _OUT:
+            for raw in frames:
                 self._sent += 1
                 self._bytes_out += len(raw)
-                on_out = self._on_out.get(_message_id(raw))
+                on_out = self._on_out.get(raw[7:10] if raw[0] == _V2 else raw[5:6] + _HIGH)
                 if on_out is not None:
-                    on_out(_payload(raw))
+                    on_out(raw)
+            return
+        for raw in frames:
+            self._received += 1
+            self._bytes_in += len(raw)
+            if raw[0] == _V2:
+                seq, system, component, msgid = raw[4], raw[5], raw[6], raw[7:10]
             else:
-                self._received += 1
-                self._bytes_in += len(raw)
-                self._take_in(raw, wall_ns)
-
-    def _take_in(self, raw: bytes, wall_ns: int) -> None:
-        frame = _frame(raw, wall_ns)
-        if frame.compid != AUTOPILOT or (self._telemetry is not None and frame.sysid != self._system):
-            return
-        if self._telemetry is None and not self._meet(frame):
-            return
-        if self._seq is not None and (missing := (frame.seq - self._seq - 1) & 0xFF) < _LOSS_MAX:
-            self._lost += missing
-        self._seq = frame.seq
-        on_in = self._on_in.get(frame.msgid)
-        if on_in is not None:
-            on_in(frame)
+                seq, system, component, msgid = raw[2], raw[3], raw[4], raw[5:6] + _HIGH
+            if component != AUTOPILOT or (system != self._system and self._telemetry is not None):
+                continue
+            if self._telemetry is None and not self._meet(_frame(raw, wall_ns)):
+                continue
+            if self._seq is not None and (missing := (seq - self._seq - 1) & 0xFF) < _LOSS_MAX:
+                self._lost += missing
+            self._seq = seq
+            on_in = self._on_in.get(msgid)
+            if on_in is not None:
+                on_in(raw, wall_ns)
+            elif (on_seldom := self._on_seldom.get(msgid)) is not None:
+                on_seldom(_frame(raw, wall_ns))
 
     def _meet(self, frame: Frame) -> bool:
         """Whether this is the first heartbeat of an autopilot; it is the one to follow."""
@@ -180,27 +196,27 @@ class Traffic:
         self._texts.update(now_us * 1e-6)
         self._tell_texts()
 
-    def _on_timesync(self, frame: Frame) -> None:
+    def _on_timesync(self, raw: bytes, wall_ns: int) -> None:
         """A request tells the vehicle's time; one that is far from its states is not believed."""
-        message = codec.decode_timesync(frame.payload)
-        t_us = message.ts1 // 1000
-        if message.tc1 != 0 or t_us <= 0:
+        tc1, ts1, _, _ = _unpacked(codec.TIMESYNC_LAYOUT, raw)
+        t_us = ts1 // 1000
+        if tc1 != 0 or t_us <= 0:
             return
         if self._state_us is None or abs(t_us - self._state_us) < _FAR_US:
-            self._advance(t_us, frame.arrival_wall_ns)
+            self._advance(t_us, wall_ns)
 
     # -- states ---------------------------------------------------------------------------------------------------
 
-    def _on_odometry(self, frame: Frame) -> None:
+    def _on_odometry(self, raw: bytes, wall_ns: int) -> None:
         assert self._telemetry is not None
-        state = self._telemetry.on_odometry(frame)
+        state = self._telemetry.on_odometry(_frame(raw, wall_ns))
         if isinstance(state, StateRejection):
             return
         t_us = state.t_vehicle_us
         if self._state_us is None and self.now_us is not None and self.now_us - t_us > _FAR_US:
             self.now_us = None  # what was believed before there were states was wrong
         self._state_us = t_us
-        self._advance(t_us, frame.arrival_wall_ns)
+        self._advance(t_us, wall_ns)
         write = self._write
         write(topics.LOCAL_POSITION, t_us, (t_us, 1, 1, 1, 1, *state.p, *state.v, yaw_from_quat(state.q)))
         write(topics.ATTITUDE, t_us, (t_us, *state.q))
@@ -217,8 +233,8 @@ class Traffic:
         state_us = self._state_us
         return state_us if state_us is not None and state_us // 1000 & 0xFFFFFFFF == t_ms else t_ms * 1000
 
-    def _on_attitude_target(self, payload: bytes) -> None:
-        t_ms, q0, q1, q2, q3, x, y, z, thrust, _, _, mask = _unpacked(codec.SET_ATTITUDE_TARGET_LAYOUT, payload)
+    def _on_attitude_target(self, raw: bytes) -> None:
+        t_ms, q0, q1, q2, q3, x, y, z, thrust, _, _, mask = _unpacked(codec.SET_ATTITUDE_TARGET_LAYOUT, raw)
         t_us, down = self._answered_us(t_ms), (0.0, 0.0, -thrust)
         if not mask & _IGNORE_ATTITUDE:
             self._write(topics.ATTITUDE_SETPOINT, t_us, (z, q0, q1, q2, q3, *down))
@@ -226,15 +242,15 @@ class Traffic:
             self._write(topics.RATES_SETPOINT, t_us, (x, y, z, *down))
         self._write(topics.THRUST_SETPOINT, t_us, (t_us, *down))
 
-    def _on_position_target(self, payload: bytes) -> None:
-        fields = _unpacked(codec.SET_POSITION_TARGET_LOCAL_NED_LAYOUT, payload)
+    def _on_position_target(self, raw: bytes) -> None:
+        fields = _unpacked(codec.SET_POSITION_TARGET_LOCAL_NED_LAYOUT, raw)
         t_ms, mask, p, v, a = fields[0], fields[12], fields[1:4], fields[4:7], fields[7:10]
         vectors = (*(_NAN3 if mask & 7 else p), *(_NAN3 if mask & 56 else v), *(_NAN3 if mask & 448 else a))
         turn = (math.nan if mask & 1024 else fields[10], math.nan if mask & 2048 else fields[11])
         self._write(topics.TRAJECTORY_SETPOINT, self._answered_us(t_ms), (*vectors, *turn))
 
-    def _on_actuator_target(self, payload: bytes) -> None:
-        fields = _unpacked(codec.SET_ACTUATOR_CONTROL_TARGET_LAYOUT, payload)
+    def _on_actuator_target(self, raw: bytes) -> None:
+        fields = _unpacked(codec.SET_ACTUATOR_CONTROL_TARGET_LAYOUT, raw)
         t_us = fields[0]
         self._write(topics.TORQUE_SETPOINT, t_us, (t_us, *fields[1:4]))
         self._write(topics.THRUST_SETPOINT, t_us, (t_us, 0.0, 0.0, -fields[4]))
@@ -325,21 +341,25 @@ class Traffic:
         self._write(topics.BATTERY, self.now_us, numbers)
 
 
-def _unpacked(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:
-    """The fields of a payload, its truncated zeros restored."""
-    return layout.unpack_from(codec.filled(payload, layout.size))
+def _by_id(handlers: dict[int, Handler]) -> dict[bytes, Handler]:
+    """By the message's id as it is in a frame of MAVLink 2."""
+    return {msgid.to_bytes(3, "little"): handler for msgid, handler in handlers.items()}
 
 
-def _message_id(raw: bytes) -> int:
-    return raw[7] | raw[8] << 8 | raw[9] << 16 if raw[0] == 0xFD else raw[5]
+def _unpacked(layout: struct.Struct, raw: bytes) -> tuple[Any, ...]:
+    """The fields of a frame's payload, its truncated zeros restored."""
+    if raw[0] == _V2 and raw[1] >= layout.size:
+        return layout.unpack_from(raw, _PAYLOAD_V2)
+    return layout.unpack_from(codec.filled(_payload(raw), layout.size))
 
 
 def _payload(raw: bytes) -> bytes:
-    return raw[10 : 10 + raw[1]] if raw[0] == 0xFD else raw[6 : 6 + raw[1]]
+    return raw[_PAYLOAD_V2 : _PAYLOAD_V2 + raw[1]] if raw[0] == _V2 else raw[6 : 6 + raw[1]]
 
 
 def _frame(raw: bytes, wall_ns: int) -> Frame:
     """The frame, which the link has checked already; the truncated zeros are left to the decoders."""
-    if raw[0] == 0xFD:
-        return Frame(_message_id(raw), raw[5], raw[6], raw[4], _payload(raw), raw, wall_ns)
+    if raw[0] == _V2:
+        msgid = raw[7] | raw[8] << 8 | raw[9] << 16
+        return Frame(msgid, raw[5], raw[6], raw[4], raw[_PAYLOAD_V2 : _PAYLOAD_V2 + raw[1]], raw, wall_ns)
     return Frame(raw[5], raw[3], raw[4], raw[2], _payload(raw), raw, wall_ns)

@@ -173,9 +173,10 @@ class Series:
     def __init__(self, topic: Topic, number: int) -> None:
         self.topic = topic
         self._codes = topic.codes
-        layout = struct.Struct(f"<HBHQ{topic.codes}")
+        layout = struct.Struct(f"<{_DATA_HEAD}sQ{topic.codes}")
         self._pack = layout.pack
-        self._head = (layout.size - _HEAD.size, ord("D"), number)
+        self.head = struct.pack("<HBH", layout.size - _HEAD.size, ord("D"), number)
+        """What a record's message begins with, before the time."""
         self._last_us = 0
 
     @cached_property
@@ -191,12 +192,14 @@ class Series:
             values: as many numbers as the fields hold. What a type cannot hold becomes what is nearest to it; NaN in
                 an integer becomes 0.
         """
-        t_us = self._last_us = max(t_us, self._last_us)
+        t_us = max(t_us, self._last_us)
         try:
-            return self._pack(*self._head, t_us, *values)
+            content = self._pack(self.head, t_us, *values)
         except (struct.error, OverflowError):
             fitting = [_fitting(code, value) for code, value in zip(self._codes, values, strict=True)]
-            return self._pack(*self._head, t_us, *fitting)
+            content = self._pack(self.head, t_us, *fitting)
+        self._last_us = t_us
+        return content
 
 
 def _fitting(code: str, value: Number) -> Number:

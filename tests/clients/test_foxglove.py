@@ -40,17 +40,15 @@ def a_log(path: Path, rows: int) -> Path:
     link = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
     none = [0.0] * 21
     log = FlightLog(CONFIGURATION, 0)
-    parts = []
     for index, row in enumerate(synthetic_flight(float(rows) / 100.0).rows[:rows]):
         t_us = round(1e6 * row[0])
         state = mavlink2.MAVLink_odometry_message(t_us, 1, 1, 1, 2, -3, [1, 0, 0, 0], 0.1, 0, 0, 0, 0, 0.2, none, none)
         heard = [mavlink2.MAVLink_heartbeat_message(2, 12, 81, 0, 4, 3), state] if index % 50 == 0 else [state]
-        parts += [log.take(Direction.IN, bytes(message.pack(link)), 1) for message in heard]
-        parts.append(log.take(Entry.ROW, row.tobytes(), 0))
+        log.take_frames(Direction.IN, [bytes(message.pack(link)) for message in heard], 1)
+        log.take(Entry.ROW, row.tobytes(), 0)
     for phase in PHASES:
-        parts.append(log.take(Entry.TEXT, bytes((Level.NOTICE,)) + f"{phase.name}: {phase.reason} ü".encode(), 0))
-    parts.append(log.end())
-    path.write_bytes(b"".join(parts))
+        log.take(Entry.TEXT, bytes((Level.NOTICE,)) + f"{phase.name}: {phase.reason} ü".encode(), 0)
+    path.write_bytes(log.end())
     return path
 
 

@@ -1,11 +1,13 @@
 """The recorder process: nothing blocks, nothing is lost that was taken, and nothing that ends a command ends it."""
 
 import contextlib
+import math
 import os
 import resource
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -19,9 +21,11 @@ from pymavlink.dialects.v20 import common as mavlink2
 from record_cases import row
 
 from companion.errors import InputError
+from companion.record.columns import COLUMNS
+from companion.record.flight_log import Entry
 from companion.record.flight_record import FlightRecord
 from companion.record.recorder import Recorder, _DiskWriter
-from companion.record.tlog import Direction, encode_datagram, read_tlog
+from companion.record.tlog import Direction, encode_datagrams, read_tlog
 
 PATIENCE_S = 30.0
 
@@ -213,7 +217,7 @@ def test_a_log_is_never_overwritten(tmp_path):
 def test_a_full_disk_is_said_once_and_ends_the_writing(capfd):
     full = os.open("/dev/full", os.O_WRONLY)
     writer = _DiskWriter(full, "link.tlog")
-    entry = encode_datagram(frame(), 4, Direction.IN)
+    entry = encode_datagrams([(4000, Direction.IN, [frame()])], 0)
     assert writer.put(entry)
     assert until(lambda: writer.error is not None)
     assert not writer.put(entry)
@@ -236,6 +240,22 @@ def test_a_flight_and_its_words_are_in_its_log(tmp_path, recorder):
     assert [text for level, _, text in log.texts if level != 6] == ["connect: heard the autopilot", "the flight ended"]
     assert log.texts[-1][:2] == (3, 1_396_000)
     assert len(log.data["vehicle_attitude"]) == 100
+
+
+def test_entries_that_nobody_can_read_are_left_out_and_counted(tmp_path, capfd, recorder):
+    record = FlightRecord(30)
+    recorder.offer(Direction.IN, frame(), time.monotonic_ns())
+    offer_steps(recorder, record, 10)
+    recorder.offer_row(bytes(24))  # no row
+    recorder.offer_row(struct.pack("=d", math.nan) * len(COLUMNS))  # a row without a time
+    recorder.offer(Entry.TEXT, b"", 0)
+    recorder.offer(99, b"of a kind that is not known: nothing is missing", 0)
+    offer_steps(recorder, record, 10)
+    recorder.close()
+    assert logged_steps(tmp_path) == [float(index) for index in range(10)] * 2
+    assert recorder.recorded == 21
+    assert recorder.problem == "link.tlog, flight.ulg: 3 entries are missing, the recorder was too slow"
+    assert capfd.readouterr().err.count("flight.ulg: an entry is left out (error: ") == 1
 
 
 def test_a_killed_recorder_leaves_a_log_up_to_the_last_second(tmp_path, recorder):

@@ -76,19 +76,18 @@ class Log(bytes):
 def logged(record: FlightRecord, *, ended: bool = True, configuration: str = CONFIGURATION) -> bytes:
     """The log that a flight with this record leaves."""
     log = FlightLog(configuration, 0)
-    parts = [log.take(Direction.IN, raw, 1) for raw in frames(99_000_000)]
+    log.take_frames(Direction.IN, frames(99_000_000), 1)
     for phase in PHASES:
-        parts.append(log.take(Entry.TEXT, bytes((Level.NOTICE,)) + f"{phase.name}: {phase.reason}".encode(), 0))
-    parts.append(log.take(Entry.FACT, f"engagement\0{ENGAGED}".encode(), 0))
+        log.take(Entry.TEXT, bytes((Level.NOTICE,)) + f"{phase.name}: {phase.reason}".encode(), 0)
+    log.take(Entry.FACT, f"engagement\0{ENGAGED}".encode(), 0)
     for index, row in enumerate(record.rows):
         if index % 500 == 0:
-            t_us = round(1e6 * row[0])
-            parts += [log.take(Direction.IN, raw, 1) for raw in frames(t_us)]
-        parts.append(log.take(Entry.ROW, row.tobytes(), 0))
-    if ended:
-        parts.append(log.take(Entry.FACT, f"outcome\0{json.dumps(OUTCOME.told())}".encode(), 0))
-        parts.append(log.end())
-    return b"".join(parts)
+            log.take_frames(Direction.IN, frames(round(1e6 * row[0])), 1)
+        log.take(Entry.ROW, row.tobytes(), 0)
+    if not ended:
+        return log.taken()
+    log.take(Entry.FACT, f"outcome\0{json.dumps(OUTCOME.told())}".encode(), 0)
+    return log.end()
 
 
 @pytest.fixture(scope="module")
@@ -193,17 +192,15 @@ def test_battery_and_messages_come_from_the_log_of_a_folder_or_alone(tmp_path: P
     """And the report shows them: guards and resets in every figure over time, the rest in the events' band."""
     settings_ = CONFIGURATION + "[vehicle.controller]\nk1_1_s = 0.5\nk2 = 4.0\ngamma_1_s3 = 2.0\n"
     log = FlightLog(settings_ + "[vehicle.limits]\ndisturbance_max_m_s2 = 3.0\n", 0)
-    parts = [log.take(Direction.IN, raw, 1) for raw in frames(99_000_000)]
+    log.take_frames(Direction.IN, frames(99_000_000), 1)
     for index, row in enumerate(record.rows):
         if index % 100 == 0:
-            parts += [
-                log.take(Direction.IN, raw, 1) for raw in (*frames(round(1e6 * row[0])), battery(90 - index // 100))
-            ]
-        parts.append(log.take(Entry.ROW, row.tobytes(), 0))
+            log.take_frames(Direction.IN, [*frames(round(1e6 * row[0])), battery(90 - index // 100)], 1)
+        log.take(Entry.ROW, row.tobytes(), 0)
         if index in {400, 500, 600}:
             said = {400: RESET, 500: GUARD, 600: WORDS}[index]
-            parts.append(log.take(Entry.TEXT, bytes((Level.NOTICE,)) + said.encode(), 0))
-    content = b"".join((*parts, log.end()))
+            log.take(Entry.TEXT, bytes((Level.NOTICE,)) + said.encode(), 0)
+    content = log.end()
     alone = read_source(written(tmp_path / "alone.ulg", content))
     record.save(tmp_path)
     write_summary(tmp_path, alone.summary)

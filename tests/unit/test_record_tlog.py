@@ -1,13 +1,21 @@
 """The traffic log: written entries, read by our reader and by pymavlink."""
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pymavlink import mavutil
 from pymavlink.dialects.v10 import ardupilotmega as mavlink1
 from pymavlink.dialects.v20 import common as mavlink2
 
-from companion.record.tlog import Direction, LoggedFrame, encode_datagram, frame_length, read_tlog, split_frames
+from companion.record.tlog import Direction, LoggedFrame, encode_datagrams, frame_length, read_tlog, split_frames
 
 EPOCH_US = 1_750_000_000_123_456  # a multiple of four: the lowest bits hold the direction
+
+
+def encoded(datagram: bytes, epoch_us: int, direction: Direction) -> bytes:
+    """Of a datagram that came or went when the monotonic clock stood at 5 s."""
+    wall_ns = 5_000_000_000
+    return encode_datagrams([(wall_ns, direction, split_frames(datagram))], 1000 * epoch_us - wall_ns)
 
 
 def sender(module=mavlink2, system: int = 1, component: int = 1):
@@ -44,21 +52,32 @@ def test_a_datagram_is_split_and_what_is_no_frame_is_left_out():
     assert split_frames(b"xx" + first + b"\x00\x01" + second + first[:9]) == [first, second]
     assert split_frames(b"") == split_frames(b"no frame at all") == []
     assert frame_length(b"\xfd\x09") == 0
-    assert encode_datagram(b"junk", EPOCH_US, Direction.IN) == b""
+    assert encoded(b"junk", EPOCH_US, Direction.IN) == b""
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.sampled_from([0xFD, 0xFE, 0, 1, 2, 5, 13]), max_size=60).map(bytes))
+def test_frames_are_found_by_their_lengths_alone(datagram: bytes):
+    found, at = [], 0
+    while at < len(datagram):
+        length = frame_length(datagram[at:])
+        whole = 0 < length <= len(datagram) - at
+        if whole:
+            found.append(datagram[at : at + length])
+        at += length if whole else 1
+    assert split_frames(datagram) == found
 
 
 def test_an_entry_is_the_stamp_in_big_endian_and_the_frame():
     frame = heartbeat(sender())
-    assert encode_datagram(frame, EPOCH_US, Direction.IN) == EPOCH_US.to_bytes(8, "big") + frame
-    assert encode_datagram(frame, EPOCH_US + 1, Direction.OUT)[:8] == (EPOCH_US | 3).to_bytes(8, "big")
+    assert encoded(frame, EPOCH_US, Direction.IN) == EPOCH_US.to_bytes(8, "big") + frame
+    assert encoded(frame, EPOCH_US + 1, Direction.OUT)[:8] == (EPOCH_US | 3).to_bytes(8, "big")
 
 
 def test_our_reader_gives_back_what_was_written(tmp_path):
     path = tmp_path / "link.tlog"
     one, two = heartbeat(sender()), heartbeat(signed_sender())
-    path.write_bytes(
-        encode_datagram(one + two, EPOCH_US, Direction.IN) + encode_datagram(one, EPOCH_US + 40, Direction.OUT)
-    )
+    path.write_bytes(encoded(one + two, EPOCH_US, Direction.IN) + encoded(one, EPOCH_US + 40, Direction.OUT))
     assert list(read_tlog(path)) == [
         LoggedFrame(EPOCH_US, Direction.IN, one),
         LoggedFrame(EPOCH_US, Direction.IN, two),
@@ -69,7 +88,7 @@ def test_our_reader_gives_back_what_was_written(tmp_path):
 @pytest.mark.parametrize("cut", [1, 7, 9, 12, 20])
 def test_a_log_that_is_cut_off_reads_up_to_there(tmp_path, cut):
     path = tmp_path / "link.tlog"
-    entry = encode_datagram(heartbeat(sender()), EPOCH_US, Direction.IN)
+    entry = encoded(heartbeat(sender()), EPOCH_US, Direction.IN)
     path.write_bytes(entry * 3 + entry[:cut])
     assert len(list(read_tlog(path))) == 3
 
@@ -81,8 +100,8 @@ def test_pymavlink_reads_the_log(tmp_path):
     answer = heartbeat(companion)
     with path.open("wb") as file:
         for index in range(50):
-            file.write(encode_datagram(b"?" + odometry + heartbeat(vehicle), EPOCH_US + 4000 * index, Direction.IN))
-            file.write(encode_datagram(answer, EPOCH_US + 4000 * index + 400, Direction.OUT))
+            file.write(encoded(b"?" + odometry + heartbeat(vehicle), EPOCH_US + 4000 * index, Direction.IN))
+            file.write(encoded(answer, EPOCH_US + 4000 * index + 400, Direction.OUT))
     log = mavutil.mavlink_connection(str(path))
     messages = []
     while (message := log.recv_match()) is not None:
