@@ -408,7 +408,7 @@ def tlog() -> Target:
     def run(data: bytes) -> None:
         with _file("link.tlog", data) as path:
             entries = list(read_tlog(path))
-        traffic = Traffic(lambda *_: None, lambda *_: None, lambda *_: None, 0)
+        traffic = Traffic(lambda *_: lambda *_: None, lambda *_: None, lambda *_: None, 0)
         for number, entry in enumerate(entries):
             traffic.take(entry.direction, split_frames(entry.raw), number)
         for number, piece in enumerate(_pieces(data)):

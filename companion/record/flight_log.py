@@ -21,7 +21,7 @@ from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES
 from companion.record.rows import RowSeries
 from companion.record.tlog import Direction, split_frames
 from companion.record.traffic import Traffic
-from companion.record.ulog import Level, Number, Series, Topic
+from companion.record.ulog import Level, Number, Series
 
 __all__ = ["Entry", "FlightLog", "Level"]
 
@@ -49,7 +49,6 @@ class Entry(IntEnum):
 
 
 _KIND_ROW: Final = int(Entry.ROW)  # an IntEnum compares slowly
-_KIND_IN: Final = int(Direction.IN)
 _DIRECTIONS: Final = {int(direction) for direction in Direction}
 
 
@@ -67,12 +66,14 @@ class FlightLog:
         self._epoch_minus_wall_ns = epoch_minus_wall_ns
         self._series = {topic.name: Series(topic, number) for number, topic in enumerate(topics.TOPICS)}
         self._rows = RowSeries([self._series[topic.name] for topic in topics.STEP_TOPICS], topics.DERIVED)
-        self._traffic = Traffic(self._write, self._say, self._set, epoch_minus_wall_ns)
         self._out: list[bytes] = []
+        self._traffic = Traffic(
+            lambda topic: self._series[topic.name].into(self._out), self._say, self._set, epoch_minus_wall_ns
+        )
         self._held: list[tuple[int, str]] = []
         self._held_parameters: dict[str, Number] = {}
         self._begun = False
-        self._synced_us = 0
+        self._due_us = 0  # of the beginning, then of the next sync mark
         self._envelope: float | None = None
         self._row_us: int | None = None
         self._interval_us = 0
@@ -101,8 +102,9 @@ class FlightLog:
     def take_frames(self, direction: int, frames: Sequence[bytes], wall_ns: int) -> None:
         """One datagram, see `Traffic.take`; as `take`."""
         self._traffic.take(direction, frames, wall_ns)
-        if direction == _KIND_IN:
-            self._begin_when_time_is_known(wall_ns)
+        now_us = self._traffic.now_us
+        if now_us is not None and now_us >= self._due_us:
+            self._begin_or_sync(now_us, wall_ns)
 
     def missed(self, count: int) -> None:
         """So many entries, counted from the beginning, did not get here."""
@@ -126,20 +128,17 @@ class FlightLog:
 
     # -- the beginning --------------------------------------------------------------------------------------------
 
-    def _begin_when_time_is_known(self, wall_ns: int) -> None:
-        now_us = self._traffic.now_us
-        if now_us is None:
-            return
-        if not self._begun:
-            self._begin(now_us, wall_ns)
-        elif now_us - self._synced_us >= _SYNC_US:
-            self._synced_us = now_us
+    def _begin_or_sync(self, now_us: int, wall_ns: int) -> None:
+        """The vehicle's time is known, or has come to where the next sync mark is due."""
+        self._due_us = now_us + _SYNC_US
+        if self._begun:
             self._out.append(ulog.sync())
+        else:
+            self._begin(now_us, wall_ns)
 
     def _begin(self, start_us: int, wall_ns: int) -> None:
         """The header and all definitions, before what has come already."""
         self._begun = True
-        self._synced_us = start_us
         parts = [ulog.header(start_us)]
         parts += [ulog.format_definition(topic) for topic in topics.TOPICS]
         parts += self._facts((wall_ns + self._epoch_minus_wall_ns) // 1000 if wall_ns else None)
@@ -171,9 +170,6 @@ class FlightLog:
             yield ulog.long_info("flight_toml", self._text)
 
     # -- what comes -----------------------------------------------------------------------------------------------
-
-    def _write(self, topic: Topic, t_us: int, values: Sequence[Number]) -> None:
-        self._out.append(self._series[topic.name].encode(t_us, values))
 
     def _say(self, level: int, text: str) -> None:
         now_us = self._traffic.now_us

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import CompanionError, InputError
+from companion.link.codec import dialect
 from companion.realtime import rejoin
 from companion.record import ring
 from companion.record.flight_log import Entry, FlightLog, Level
@@ -154,8 +155,8 @@ class Recorder:
         self.offer(Entry.SYSTEM, bytes((system,)), 0)
 
     def give_way(self) -> None:
-        """The vehicle is in lockstep: the logs are written when the ring is half full and at the end, so that the child
-        leaves the processors to the two processes that wait for each other."""
+        """The vehicle is in lockstep: the logs are written whenever three quarters of the ring are full, all of it at
+        once, and at the end: the child leaves the processors to the two processes that wait for each other."""
         self._writer.be_patient()
 
     def close(self, timeout_s: float = 30.0) -> None:
@@ -381,6 +382,8 @@ def main(arguments: list[str]) -> int:
         flight = _FlightFile(log, FlightLog(_configuration(Path(arguments[5])), epoch_minus_wall_ns))
         with contextlib.suppress(OSError):  # the control process died meanwhile: the end of the pair follows
             link.send(_READY)
+        with contextlib.suppress(ImportError):  # on the ground, and not when the first seldom message comes
+            dialect()
         _receive(link, reader, traffic, flight)
         traffic.writer.close()
         flight.writer.close()

@@ -129,7 +129,7 @@ class RingWriter(_Ring):
         return True
 
     def be_patient(self) -> None:
-        """Let the reader wait until the ring is half full: its work would take the processor from who writes."""
+        """Let the reader wait until three quarters of the ring are full: its work takes the writer's processor."""
         self._numbers[_PATIENT] = 1
 
     def close(self) -> None:
@@ -161,7 +161,7 @@ class RingReader(_Ring):
     def may_wait(self) -> bool:
         """Whether the writer wants its processor for itself, and there is room enough for that."""
         numbers = self._numbers
-        return bool(numbers[_PATIENT]) and 2 * (numbers[_WRITTEN] - numbers[_READ]) < self._size
+        return bool(numbers[_PATIENT]) and 4 * (numbers[_WRITTEN] - numbers[_READ]) < 3 * self._size
 
     def take(self) -> Iterator[list[Entry]]:
         """The entries that were there at the last look already, some hundred at a time."""
@@ -179,23 +179,20 @@ class RingReader(_Ring):
 
     def _take_batch(self, limit: int) -> list[Entry]:
         """Copies entries out, and gives their room back."""
-        memory, size, head_of = self._map, self._size, _ENTRY.unpack_from
+        memory, head_of = self._map, _ENTRY.unpack_from
         entries: list[Entry] = []
-        done = self._done
-        while done < limit and len(entries) < _BATCH:
-            at = done % size
-            left = size - at
-            if left < _HEAD:
-                done += left
-                continue
-            at += _HEAD_BYTES
+        start = at = _HEAD_BYTES + self._done % self._size
+        stop, last = at + limit - self._done, len(memory) - _HEAD  # no entry begins behind
+        while at < stop and at <= last and len(entries) < _BATCH:
             wall_ns, length, kind = head_of(memory, at)
             if length == _SKIP:
-                done += left
-                continue
-            at += _HEAD
-            entries.append((wall_ns, kind, memory[at : at + length]))
-            done += _HEAD + length
-        self._done = self._numbers[_READ] = done
+                at = len(memory)
+                break
+            begin = at + _HEAD
+            at = begin + length
+            entries.append((wall_ns, kind, memory[begin:at]))
+        if last < at < stop:
+            at = len(memory)  # too little for a head: the next one is at the beginning
+        self._done = self._numbers[_READ] = self._done + at - start
         self._numbers[_TAKEN] += len(entries)
         return entries

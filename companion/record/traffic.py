@@ -21,8 +21,8 @@ from companion.record import topics
 from companion.record.tlog import Direction
 from companion.record.ulog import Level, Number, Topic
 
-Write = Callable[[Topic, int, Sequence[Number]], None]
-"""Takes a topic, vehicle time [us] and the numbers."""
+Write = Callable[[int, Sequence[Number]], None]
+"""Takes vehicle time [us] and the numbers of a record."""
 Handler = TypeVar("Handler")
 Say = Callable[[int, str], None]
 """Takes a severity and a text."""
@@ -50,6 +50,7 @@ ROTARY_WINGS: Final = {2, 3, 4, 13, 14, 15}  # MAV_TYPE: quadrotor, coaxial, hel
 
 _OUT: Final = int(Direction.OUT)
 _V2: Final = 0xFD  # the first byte of a frame of MAVLink 2
+_HEAD_V2 = struct.Struct("4x3B3s").unpack_from  # sequence number, system, component, id of the message
 _PAYLOAD_V2: Final = 10  # where its payload begins
 _HIGH: Final = bytes(2)  # the rest of a message's id that MAVLink 1 does not have
 _SECOND_US: Final = 1_000_000
@@ -64,7 +65,7 @@ class Traffic:
     """Follows one autopilot.
 
     Args:
-        write: gets the records.
+        writer: gives, for a topic, what takes its records.
         say: gets what belongs into the log as a text.
         parameter: gets each of the autopilot's parameters that is read, and MAV_TYPE, when it is new or another than
             before.
@@ -72,13 +73,26 @@ class Traffic:
     """
 
     def __init__(
-        self, write: Write, say: Say, parameter: Callable[[str, Number], None], epoch_minus_wall_ns: int
+        self,
+        writer: Callable[[Topic], Write],
+        say: Say,
+        parameter: Callable[[str, Number], None],
+        epoch_minus_wall_ns: int,
     ) -> None:
         self.now_us: int | None = None
         """Vehicle time as far as it was heard [us]; never steps back."""
         self.dropped = 0
         """Entries that are missing in the log, as far as somebody told us."""
-        self._write, self._say, self._parameter = write, say, parameter
+        self._say, self._parameter = say, parameter
+        self._writers = {
+            topic.name: writer(topic)
+            for topic in (*topics.STATE_TOPICS, *topics.SETPOINT_TOPICS, *topics.REPORT_TOPICS)
+        }
+        self._write_position, self._write_attitude, self._write_rates = (
+            self._writers[topic.name] for topic in topics.STATE_TOPICS
+        )
+        self._write_rates_setpoint = self._writers[topics.RATES_SETPOINT.name]
+        self._write_thrust_setpoint = self._writers[topics.THRUST_SETPOINT.name]
         self._epoch_minus_wall_ns = epoch_minus_wall_ns
         self._telemetry: Telemetry | None = None
         self._system = 0
@@ -120,6 +134,9 @@ class Traffic:
             }
         )
 
+    def _write(self, topic: Topic, t_us: int, values: Sequence[Number]) -> None:
+        self._writers[topic.name](t_us, values)
+
     def take(self, direction: int, frames: Sequence[bytes], wall_ns: int) -> None:
         """One datagram.
 
@@ -140,7 +157,7 @@ class Traffic:
             self._received += 1
             self._bytes_in += len(raw)
             if raw[0] == _V2:
-                seq, system, component, msgid = raw[4], raw[5], raw[6], raw[7:10]
+                seq, system, component, msgid = _HEAD_V2(raw)
             else:
                 seq, system, component, msgid = raw[2], raw[3], raw[4], raw[5:6] + _HIGH
             if component != AUTOPILOT or (system != self._system and self._telemetry is not None):
@@ -175,11 +192,12 @@ class Traffic:
     # -- time -----------------------------------------------------------------------------------------------------
 
     def _advance(self, t_us: int, wall_ns: int) -> None:
-        if self.now_us is None or t_us > self.now_us:
-            self.now_us = t_us
+        now_us = self.now_us
+        if now_us is None or t_us > now_us:
+            self.now_us = now_us = t_us
         if self._told_us is None:
-            self._told_us, self._told_bytes = self.now_us, (self._bytes_in, self._bytes_out)
-        elif self.now_us - self._told_us >= _SECOND_US:
+            self._told_us, self._told_bytes = now_us, (self._bytes_in, self._bytes_out)
+        elif now_us - self._told_us >= _SECOND_US:
             self._tell_link(wall_ns)
 
     def _tell_link(self, wall_ns: int) -> None:
@@ -212,19 +230,18 @@ class Traffic:
         state = self._telemetry.on_odometry(_frame(raw, wall_ns))
         if isinstance(state, StateRejection):
             return
-        t_us = state.t_vehicle_us
+        t_us, p, v, q, w, resets = state
         if self._state_us is None and self.now_us is not None and self.now_us - t_us > _FAR_US:
             self.now_us = None  # what was believed before there were states was wrong
         self._state_us = t_us
         self._advance(t_us, wall_ns)
-        write = self._write
-        write(topics.LOCAL_POSITION, t_us, (t_us, 1, 1, 1, 1, *state.p, *state.v, yaw_from_quat(state.q)))
-        write(topics.ATTITUDE, t_us, (t_us, *state.q))
-        write(topics.ANGULAR_VELOCITY, t_us, (t_us, *state.w))
-        if state.reset_counter != self._resets:
+        self._write_position(t_us, (t_us, 1, 1, 1, 1, *p, *v, yaw_from_quat(q)))
+        self._write_attitude(t_us, (t_us, *q))
+        self._write_rates(t_us, (t_us, *w))
+        if resets != self._resets:
             if self._resets is not None:
-                self._say(Level.WARNING, f"the autopilot's estimate was reset (reset counter {state.reset_counter})")
-            self._resets = state.reset_counter
+                self._say(Level.WARNING, f"the autopilot's estimate was reset (reset counter {resets})")
+            self._resets = resets
 
     # -- setpoints ------------------------------------------------------------------------------------------------
 
@@ -239,8 +256,8 @@ class Traffic:
         if not mask & _IGNORE_ATTITUDE:
             self._write(topics.ATTITUDE_SETPOINT, t_us, (z, q0, q1, q2, q3, *down))
         elif not mask & _IGNORE_RATES:
-            self._write(topics.RATES_SETPOINT, t_us, (x, y, z, *down))
-        self._write(topics.THRUST_SETPOINT, t_us, (t_us, *down))
+            self._write_rates_setpoint(t_us, (x, y, z, *down))
+        self._write_thrust_setpoint(t_us, (t_us, *down))
 
     def _on_position_target(self, raw: bytes) -> None:
         fields = _unpacked(codec.SET_POSITION_TARGET_LOCAL_NED_LAYOUT, raw)
@@ -253,7 +270,7 @@ class Traffic:
         fields = _unpacked(codec.SET_ACTUATOR_CONTROL_TARGET_LAYOUT, raw)
         t_us = fields[0]
         self._write(topics.TORQUE_SETPOINT, t_us, (t_us, *fields[1:4]))
-        self._write(topics.THRUST_SETPOINT, t_us, (t_us, 0.0, 0.0, -fields[4]))
+        self._write_thrust_setpoint(t_us, (t_us, 0.0, 0.0, -fields[4]))
 
     # -- what the autopilot says of itself ------------------------------------------------------------------------
 
@@ -361,5 +378,7 @@ def _frame(raw: bytes, wall_ns: int) -> Frame:
     """The frame, which the link has checked already; the truncated zeros are left to the decoders."""
     if raw[0] == _V2:
         msgid = raw[7] | raw[8] << 8 | raw[9] << 16
-        return Frame(msgid, raw[5], raw[6], raw[4], raw[_PAYLOAD_V2 : _PAYLOAD_V2 + raw[1]], raw, wall_ns)
+        payload = raw[_PAYLOAD_V2 : _PAYLOAD_V2 + raw[1]]
+        # A NamedTuple's own constructor takes three times as long.
+        return tuple.__new__(Frame, (msgid, raw[5], raw[6], raw[4], payload, raw, wall_ns))
     return Frame(raw[5], raw[3], raw[4], raw[2], _payload(raw), raw, wall_ns)

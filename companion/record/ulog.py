@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -200,6 +200,22 @@ class Series:
             content = self._pack(self.head, t_us, *fitting)
         self._last_us = t_us
         return content
+
+    def into(self, out: list[bytes]) -> Callable[[int, Sequence[Number]], None]:
+        """What puts a record behind the others in a list: `encode` in one call, where nothing needs care."""
+        pack, head, append = self._pack, self.head, out.append
+
+        def write(t_us: int, values: Sequence[Number]) -> None:
+            if t_us < self._last_us:
+                append(self.encode(t_us, values))
+                return
+            try:
+                append(pack(head, t_us, *values))
+                self._last_us = t_us
+            except (struct.error, OverflowError):
+                append(self.encode(t_us, values))
+
+        return write
 
 
 def _fitting(code: str, value: Number) -> Number:

@@ -242,7 +242,8 @@ def test_a_flight_and_its_words_are_in_its_log(tmp_path, recorder):
     assert len(log.data["vehicle_attitude"]) == 100
 
 
-def test_entries_that_nobody_can_read_are_left_out_and_counted(tmp_path, capfd, recorder):
+def test_entries_that_nobody_can_read_are_left_out_and_counted(tmp_path, capfd):
+    recorder = Recorder.start(tmp_path)
     record = FlightRecord(30)
     recorder.offer(Direction.IN, frame(), time.monotonic_ns())
     offer_steps(recorder, record, 10)

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable
+from unittest import mock
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,9 +30,15 @@ def make(size_bytes: int) -> tuple[RingWriter, RingReader]:
 @settings(max_examples=60, deadline=None)
 @given(
     size=st.integers(64, 600),
+    batch=st.sampled_from([1, 3, 256]),
     steps=st.lists(st.one_of(st.binary(max_size=90), st.sampled_from(["take", "rest"])), max_size=120),
 )
-def test_what_was_put_comes_out_once_and_in_order(size, steps):
+def test_what_was_put_comes_out_once_and_in_order(size, batch, steps):
+    with mock.patch.object(ring, "_BATCH", batch):
+        _put_and_take(size, steps)
+
+
+def _put_and_take(size: int, steps: list[bytes | str]) -> None:
     writer, reader = make(size)
     put: list[Entry] = []
     got: list[Entry] = []
@@ -106,16 +113,17 @@ def test_entries_of_any_size_keep_their_content():
         assert flat(reader.take_rest()) == [(-5, 7, content)]
 
 
-def test_a_patient_writer_lets_the_reader_wait_until_the_ring_is_half_full():
-    writer, reader = make(230)
+def test_a_patient_writer_lets_the_reader_wait_until_three_quarters_of_the_ring_are_full():
+    writer, reader = make(184)
     assert writer.put(0, b"0123456789", 0)
     assert not reader.may_wait  # nobody said so
     writer.be_patient()
     assert reader.may_wait
-    for _ in range(3):
+    for _ in range(4):
         assert reader.may_wait
         assert writer.put(0, b"0123456789", 0)  # 23 bytes each
-    assert writer.put(0, b"0123456789", 0)  # half of it
+    assert reader.may_wait
+    assert writer.put(0, b"0123456789", 0)  # three quarters of it
     assert not reader.may_wait
-    assert len(flat(reader.take_rest())) == 5
+    assert len(flat(reader.take_rest())) == 6
     assert reader.may_wait
