@@ -99,6 +99,21 @@ def test_numbers_that_do_not_fit_become_the_nearest_that_do() -> None:
     assert parse(ulog.header(0) + ulog.parameter("whole", 2**31)).parameters == {"whole": 2.0**31}
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 2**63), st.lists(st.floats(), min_size=11, max_size=11)), max_size=4))
+def test_what_is_put_into_a_list_is_what_encode_gives(records) -> None:
+    one, other = Series(topics.TRAJECTORY_SETPOINT, 3), Series(topics.TRAJECTORY_SETPOINT, 3)
+    out: list[bytes] = []
+    write = one.into(out)
+    for record in records:
+        write(*record)
+    assert out == [other.encode(*record) for record in records]
+    with pytest.raises(struct.error):
+        write(2**64, [0.0] * 11)
+    write(2**63, [0.0] * 11)
+    assert out[len(records) :] == [other.encode(2**63, [0.0] * 11)]
+
+
 def test_times_never_step_back() -> None:
     writer = Series(topics.DISTURBANCE, 0)
     times = [struct.unpack_from("<Q", writer.encode(t, (0.0, 0.0, 0.0)), 5)[0] for t in (5, 9, 7, 10)]
