@@ -2,20 +2,20 @@
 
 In real time every vehicle has a deadline for its next state, spread evenly over the period so that they do not all come
 at once. In lockstep every vehicle follows its own companion, as it would alone: the same seed gives the same flight.
-Between deadlines the thread sleeps in one poll over all sockets.
+Between deadlines the thread sleeps in one wait over all sockets.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
-import select
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from .peer import HEARTBEAT_WALL_S, PATIENCE_S, SLICE_S, Peer, PeerOptions
 from .vehicle import Vehicle, VehicleOptions
+from .waiting import Waiter
 
 SPACING_M = 3.0
 """Between neighbours, eastwards."""
@@ -72,7 +72,7 @@ class Member(Peer):
 
     @property
     def descriptors(self) -> list[int]:
-        """Its sockets, as poll tells them."""
+        """Its sockets, as a wait tells them."""
         return [endpoint.fileno() for endpoint in self._endpoints]
 
     def hear(self, descriptor: int) -> None:
@@ -156,7 +156,7 @@ class Fleet:
             PortError: a port is in use.
         """
         self._stopped = stopped
-        self._poll = select.poll()
+        self._waiter = Waiter()
         self.members: list[Member] = []
         try:
             for vehicle, options in vehicles:
@@ -166,7 +166,7 @@ class Fleet:
                         options,
                         stopped=stopped,
                         notice=_named(vehicle.system, notice),
-                        poll=self._poll,
+                        waiter=self._waiter,
                         sharers=len(vehicles),
                     )
                 )
@@ -177,7 +177,7 @@ class Fleet:
 
     def run(self, duration_s: float | None = None) -> None:
         """Run until told to stop, or until every vehicle's time has reached a duration."""
-        clock, poll, owners = time.monotonic, self._poll.poll, self._owners
+        clock, wait, owners = time.monotonic, self._waiter.wait, self._owners
         begin_s = clock()
         calendar: list[tuple[float, int]] = []
         for k, member in enumerate(self.members):
@@ -187,7 +187,7 @@ class Fleet:
         flying = set(self.members)
         while flying and not self._stopped():
             left_s = min(calendar[0][0] - clock(), SLICE_S)
-            for descriptor, _ in poll(max(0.0, left_s) * 1e3):
+            for descriptor in wait(left_s):
                 member = owners[descriptor]
                 member.hear(descriptor)
                 if member.due_s == math.inf:

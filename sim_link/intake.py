@@ -7,12 +7,12 @@ receiver that is asked too much.
 
 from __future__ import annotations
 
-import select
 from collections import deque
 
 from .codec import Frame
 from .datagram_faults import LinkFaults
 from .udp import Address, UdpEndpoint
+from .waiting import Waiter
 
 ALLOWANCE_PER_S = 5000.0
 """Of each socket, in wall time. A companion with setpoints at 250 Hz uses about 800 of it."""
@@ -26,11 +26,11 @@ def allowance(state_period_s: float, sharers: int = 1) -> int:
 
 
 class Intake:
-    """The messages of one socket, which is registered in a poll while more of them may be acted on."""
+    """The messages of one socket, which is waited for while more of them may be acted on."""
 
-    def __init__(self, endpoint: UdpEndpoint, poll: select.poll, per_state: int) -> None:
+    def __init__(self, endpoint: UdpEndpoint, waiter: Waiter, per_state: int) -> None:
         self._endpoint = endpoint
-        self._poll = poll
+        self._waiter = waiter
         self._listens = False
         self._per_state = per_state
         self.left = per_state
@@ -42,16 +42,16 @@ class Intake:
         self.listen()
 
     def listen(self) -> None:
-        """Let the poll wake up for the socket."""
+        """Let the socket end a wait."""
         if not self._listens:
             self._listens = True
-            self._poll.register(self._endpoint.fileno(), select.POLLIN)
+            self._waiter.register(self._endpoint.fileno())
 
     def ignore(self) -> None:
-        """Let the poll not wake up for the socket."""
+        """Let the socket end no wait."""
         if self._listens:
             self._listens = False
-            self._poll.unregister(self._endpoint.fileno())
+            self._waiter.unregister(self._endpoint.fileno())
 
     def refill(self) -> None:
         """Begin a new state."""

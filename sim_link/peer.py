@@ -9,7 +9,6 @@ the same seed and the same companion give the same flight to the byte.
 
 from __future__ import annotations
 
-import select
 import time
 from collections import deque
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from .link import Link
 from .truth_log import TruthLog, row
 from .udp import Address, UdpEndpoint
 from .vehicle import Vehicle
+from .waiting import Waiter
 
 PATIENCE_S = 1.0
 """Wall time that the clock waits for a companion's answer; then it runs on at real time until one answers again."""
@@ -79,7 +79,7 @@ class Peer:
         *,
         stopped: Callable[[], bool] = _never,
         notice: Callable[[str], None] = _silent,
-        poll: select.poll | None = None,
+        waiter: Waiter | None = None,
         sharers: int = 1,
     ) -> None:
         """Open the sockets.
@@ -90,7 +90,7 @@ class Peer:
             stopped: asked often; once it says yes, `run` returns.
             notice: gets a sentence when the companion falls silent in lockstep, when it is back, and when a fault
                 begins or ends.
-            poll: where the sockets register; None: one of its own.
+            waiter: where the sockets register; None: one of its own.
             sharers: vehicles that share the thread (see `fleet`), and with it what is heard per state.
 
         Raises:
@@ -124,9 +124,9 @@ class Peer:
         self._stopped = stopped
         self._notice = notice
         self._endpoints = [self.companion] if self.ground is None else [self.companion, self.ground]
-        self._poll = select.poll() if poll is None else poll
+        self._waiter = Waiter() if waiter is None else waiter
         per_state = allowance(self.state_wall_s, sharers)
-        self._intakes = [Intake(endpoint, self._poll, per_state) for endpoint in self._endpoints]
+        self._intakes = [Intake(endpoint, self._waiter, per_state) for endpoint in self._endpoints]
         self._waiting: deque[tuple[list[Frame], Address]] = deque()
         self._spin_vain = 0
         """States for which sleeping at once is the better choice, when polling was in vain last."""
@@ -219,7 +219,7 @@ class Peer:
                 self.vehicle.heartbeat()
                 self._flush()
             timeout_s = max(0.0, min(SLICE_S, next_heartbeat_s - now_s))
-            if self._poll.poll(timeout_s * 1e3) and self._hear_first():
+            if self._waiter.wait(timeout_s) and self._hear_first():
                 return True
         return False
 
@@ -358,7 +358,7 @@ class Peer:
 
     def _serve(self, timeout_s: float) -> None:
         """Wait until something is received, and act on it."""
-        for descriptor, _ in self._poll.poll(max(0.0, timeout_s) * 1e3):
+        for descriptor in self._waiter.wait(timeout_s):
             if descriptor == self.companion.fileno():
                 self._hear_companion()
             else:
