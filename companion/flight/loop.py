@@ -23,6 +23,7 @@ from companion.control.types import State
 from companion.errors import LinkError
 from companion.flight.accounting import Accounting, FlownStep, Progress
 from companion.flight.adaptation import Adaptation, adapted
+from companion.flight.attitudes import Attitudes
 from companion.flight.calibration import Calibrator
 from companion.flight.clock import VehicleClock
 from companion.flight.coast import coast_setpoint
@@ -45,7 +46,7 @@ from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
 from companion.link.framing import Frame
-from companion.link.operations import STOP_MESSAGE, Operations
+from companion.link.operations import DEFAULT_INTERVAL, STOP_MESSAGE, Operations
 from companion.link.setpoint import SetpointSender, UnsendableSetpoint
 from companion.link.telemetry import StateRejection, Telemetry, VehicleState
 from companion.link.timesync import PacedPeer
@@ -138,6 +139,7 @@ class FlightLoop:
         self._paced = paced
         self._tell_met = met
         self._lookout = lookout
+        self._attitudes = Attitudes()
         self._autopilot = Autopilot()
         self._compiled = compiled
         self._adaptation: Adaptation | None = None
@@ -371,9 +373,9 @@ class FlightLoop:
         if self._peer.paced:
             return self._wire.receive(self._wait_s(), LOCKSTEP_SPIN_S)
         if self._lookout is None or self._sequence.duty is Duty.NOTHING:
-            return self._wire.receive(self._wait_s())
+            return self._wire.receive(self._wait_s(), until=codec.ODOMETRY)
         look = self._lookout.look(self._turned_ns)
-        return self._wire.receive(self._wait_s(), look.spin_s, look.sleep_s)
+        return self._wire.receive(self._wait_s(), look.spin_s, look.sleep_s, codec.ODOMETRY)
 
     def _wait_s(self) -> float:
         idle = self._peer.paced or (self._sequence.duty is Duty.NOTHING and self._sequence.ending is None)
@@ -434,6 +436,9 @@ class FlightLoop:
         self._clock.on_state(state.t_vehicle_us, frame.arrival_wall_ns)
         if self._lookout is not None:
             self._lookout.on_state(frame.arrival_wall_ns)
+        if self._attitudes.waste(state.t_vehicle_us):
+            now_s = self._clock.now_s(frame.arrival_wall_ns)
+            self._ops.set_message_interval(codec.ATTITUDE_QUATERNION, DEFAULT_INTERVAL, now_s)
         meter = self._sequence.preflight.meter
         if meter.running:
             meter.on_state(state, self._clock.now_s(frame.arrival_wall_ns), paced=self._peer.paced)
@@ -442,6 +447,7 @@ class FlightLoop:
         """One that is newer than the state which is answered next refreshes the prediction, and asks for no answer."""
         sample = self._telemetry.on_attitude(frame)
         if not (self._peer.paced or isinstance(sample, StateRejection)):
+            self._attitudes.on_attitude(sample.t_vehicle_us)
             tracker.refresh(Attitude(sample.t_vehicle_us * 1e-6, sample.q, sample.w))
 
     def _on_timesync(self, frame: Frame) -> None:

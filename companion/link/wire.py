@@ -39,6 +39,7 @@ TAP_OUT: Final = 3  # the numbers that a traffic log (.tlog) has for the directi
 COMPANION_COMPONENT: Final = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _AUTOPILOT_COMPONENT: Final = 1
 _READS_MAX = 256
+_MSGID = slice(7, 10)
 _DATAGRAM_MAX = 1400
 """Several frames in one datagram stay within what a network takes whole."""
 _UNTOLD_MAX = 1000
@@ -83,6 +84,8 @@ class Wire:
         self._gathered: list[bytes] | None = None
         self._owned: KeptSigner | None = None
         self._kept: list[Frame] = []
+        self._unread: list[tuple[bytes, Address | None, int]] = []
+        """Datagrams that were read and not used yet, with their sender and arrival."""
         self._heard_ns = self._greeted_ns = 0
         self._outdated = 0
         self._poll = select.poll()
@@ -137,7 +140,9 @@ class Wire:
         """What came and was not used because of who sent it, by reason."""
         return refusals(self.counters, self._guard)
 
-    def receive(self, timeout_s: float, spin_s: float = 0.0, sleep_s: float = 0.0) -> list[Frame]:
+    def receive(
+        self, timeout_s: float, spin_s: float = 0.0, sleep_s: float = 0.0, until: int | None = None
+    ) -> list[Frame]:
         """Wait for the link at most this long, then return every good frame that is there, in the order of arrival.
 
         An empty list may come early (garbage, foreign senders, a line that fell silent): the caller watches the clock
@@ -150,6 +155,8 @@ class Wire:
                 for, which costs more than the wait itself. For a vehicle in lockstep: what was found this way is one
                 datagram, after which nothing comes before it is answered.
             sleep_s: before that, sleep for this long at most, exactly; what comes meanwhile ends it.
+            until: a message: datagrams behind the newest one that begins with it are left to the next call, which does
+                not wait then. For who answers this message in a hurry.
 
         Raises:
             LinkError: the serial line is gone.
@@ -161,6 +168,9 @@ class Wire:
             return kept
         frames: list[Frame] = []
         unknown: list[bytes] = []
+        if self._unread:
+            self._use(frames, unknown, None)
+            return self._noted(frames, unknown)
         woken = sleep_s > 0.0 and bool(select.select([self._transport.fileno()], [], [], sleep_s)[0])
         if woken or not self._spin(spin_s, frames, unknown):
             if self._line is not None:
@@ -169,12 +179,47 @@ class Wire:
                 if self._line is None:
                     return frames
                 self._rest(self._line, frames, unknown)
-            for _ in range(_READS_MAX):
-                if not self._read(frames, unknown):
-                    break
+            if self._line is None:
+                self._read_datagrams()
+                self._use(frames, unknown, until)
+            else:
+                for _ in range(_READS_MAX):
+                    if not self._read(frames, unknown):
+                        break
+        return self._noted(frames, unknown)
+
+    def _noted(self, frames: list[Frame], unknown: list[bytes]) -> list[Frame]:
         if self._tap is not None:
             self._note(frames, unknown)
         return frames
+
+    def _read_datagrams(self) -> None:
+        """Read what is there, to be used one after the other."""
+        read, unread, now = self._transport.read, self._unread, time.monotonic_ns
+        for _ in range(_READS_MAX):
+            try:
+                got = read()
+            except OSError:  # the network's report about something sent earlier; it says nothing about what comes
+                self.counters.unreachable += 1
+                continue
+            if got is None:
+                return
+            unread.append((*got, now()))
+
+    def _use(self, frames: list[Frame], unknown: list[bytes], until: int | None) -> None:
+        """Use the datagrams that were read, up to the newest of the peer's that begins with a message, if one does."""
+        unread = self._unread
+        end = len(unread)
+        if until is not None and end > 1:
+            begin = until.to_bytes(3, "little")
+            for i in range(end - 1, -1, -1):
+                data, address, _ = unread[i]
+                if data[_MSGID] == begin and data[0] == MAGIC_V2 and address == self.peer:
+                    end = i + 1
+                    break
+        for data, address, wall_ns in unread[:end]:
+            self._parse_datagram(data, address, wall_ns, frames, unknown)
+        del unread[:end]
 
     def keep(self, frames: list[Frame]) -> None:
         """Have frames that were received and not used yet received again, before all others."""

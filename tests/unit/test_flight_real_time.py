@@ -69,7 +69,9 @@ class VirtualWire:
     def offboard_s(self) -> float:
         return -math.inf if self.offboard_us is None else (self.vehicle.t_us - self.offboard_us) * 1e-6
 
-    def receive(self, timeout_s: float, spin_s: float = 0.0, sleep_s: float = 0.0) -> list[Frame]:
+    def receive(
+        self, timeout_s: float, spin_s: float = 0.0, sleep_s: float = 0.0, until: int | None = None
+    ) -> list[Frame]:
         if spin_s > 0.0:
             self.looks.append((self.offboard_s, self.now_ns + 1e9 * sleep_s, 1e9 * spin_s, self._next_ns))
         if self.stall is not None and self.offboard_s >= self.stall[0]:
