@@ -5,8 +5,7 @@ Without it a process that wakes in the middle of a step takes the core until the
 a busy ground link the step's 99th percentile is two to three times what it is without.
 
 With `--realtime`, and each said: a scheduling class above everything ordinary, memory that is not swapped out, timers
-without slack, a core to stay on. Nothing of it is needed for a flight. (It looks out for states without sleeping, too:
-`flight.lookout`.)
+without slack, a core to stay on. Nothing of it is needed for a flight.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ RealtimeOption = Annotated[
     typer.Option(
         "--realtime",
         help="Ask the system for a real-time scheduling class, locked memory, exact timers and a core of its own"
-        " choice, and look out for states without sleeping when they are due; what is not permitted is said.",
+        " choice; what is not permitted is said.",
     ),
 ]
 VehicleOption = Annotated[

@@ -32,7 +32,6 @@ from companion.flight.controller import controller_of
 from companion.flight.course import Course, Timed, at_rest
 from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
-from companion.flight.lookout import Lookout
 from companion.flight.measure import silence_limit_s
 from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
 from companion.flight.preflight import Preflight
@@ -100,7 +99,6 @@ class FlightLoop:
         delayed: called with the delays that were predicted over since the last time; must not block.
         only_gates: nothing is flown: it ends when the gates have judged.
         met: called once with the vehicle's system id, before anything else of it is used; must not block.
-        lookout: when to look out for states without sleeping; None: never.
     """
 
     def __init__(
@@ -121,7 +119,6 @@ class FlightLoop:
         only_gates: bool = False,
         paced: Callable[[bool], None] = lambda waits: None,
         met: Callable[[int], None] = lambda system: None,
-        lookout: Lookout | None = None,
     ) -> None:
         self._flight = flight
         self._trajectory = trajectory
@@ -138,7 +135,6 @@ class FlightLoop:
         self._only_gates = only_gates
         self._paced = paced
         self._tell_met = met
-        self._lookout = lookout
         self._attitudes = Attitudes()
         self._autopilot = Autopilot()
         self._compiled = compiled
@@ -357,7 +353,8 @@ class FlightLoop:
 
     def _turn(self) -> None:
         self._turned_ns = time.monotonic_ns()
-        for frame in self._receive():
+        spin_s = LOCKSTEP_SPIN_S if self._peer.paced else 0.0
+        for frame in self._wire.receive(self._wait_s(), spin_s, until=codec.ODOMETRY):  # that is answered before others
             self._on_frame(frame)
         if not self._peer.paced:
             self._answer_state()
@@ -367,15 +364,6 @@ class FlightLoop:
         self._account()
         self._host.turn()
         self._look_at_the_wall_clock()
-
-    def _receive(self) -> list[Frame]:
-        """Waits for the link, as what is waited for suggests."""
-        if self._peer.paced:
-            return self._wire.receive(self._wait_s(), LOCKSTEP_SPIN_S)
-        if self._lookout is None or self._sequence.duty is Duty.NOTHING:
-            return self._wire.receive(self._wait_s(), until=codec.ODOMETRY)
-        look = self._lookout.look(self._turned_ns)
-        return self._wire.receive(self._wait_s(), look.spin_s, look.sleep_s, codec.ODOMETRY)
 
     def _wait_s(self) -> float:
         idle = self._peer.paced or (self._sequence.duty is Duty.NOTHING and self._sequence.ending is None)
@@ -434,8 +422,6 @@ class FlightLoop:
         self._pending_wall_ns = frame.arrival_wall_ns
         self._peer.on_state(state.t_vehicle_us)
         self._clock.on_state(state.t_vehicle_us, frame.arrival_wall_ns)
-        if self._lookout is not None:
-            self._lookout.on_state(frame.arrival_wall_ns)
         if self._attitudes.waste(state.t_vehicle_us):
             now_s = self._clock.now_s(frame.arrival_wall_ns)
             self._ops.set_message_interval(codec.ATTITUDE_QUATERNION, DEFAULT_INTERVAL, now_s)

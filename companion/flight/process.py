@@ -23,7 +23,6 @@ from companion.errors import CompanionError, ExitCode
 from companion.flight.accounting import Progress
 from companion.flight.controller import controller_of
 from companion.flight.host import Host
-from companion.flight.lookout import Lookout
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.preflight import BASELINE_PARAMETERS, gate_gains
@@ -134,7 +133,6 @@ class Ready:
         timeout_s: float,
         system: int | None = None,
         host: Host | None = None,
-        realtime: bool = False,
     ) -> FlightLoop:
         """The loop that flies it over a link; arguments as of `FlightLoop`."""
 
@@ -157,7 +155,6 @@ class Ready:
             host=host,
             paced=pace,
             met=self.recorder.follow,
-            lookout=Lookout(1.0 / self.flight.vehicle.link.state_rate_hz) if realtime else None,
             engaged=lambda engagement: self.recorder.state("engagement", json.dumps(asdict(engagement))),
             delayed=lambda delays: self.recorder.state("delays", json.dumps(delays)),
         )
@@ -204,7 +201,7 @@ def fly(
     connection = link.connection
     try:
         with link.open(ready.recorder.offer) as wire:
-            loop = ready.loop(wire, status, connection=connection, timeout_s=timeout_s, realtime=realtime)
+            loop = ready.loop(wire, status, connection=connection, timeout_s=timeout_s)
             signals.hand_to(loop)
             status.send(ready=True)
             outcome = loop.run()

@@ -174,7 +174,6 @@ class Control:
             timeout_s=CONNECT_TIMEOUT_S,
             system=self._standby.system,
             host=self,
-            realtime=self._settings.realtime,
         )
         refused_before = self._wire.refusals
         outcome = loop.run()

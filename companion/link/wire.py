@@ -140,9 +140,7 @@ class Wire:
         """What came and was not used because of who sent it, by reason."""
         return refusals(self.counters, self._guard)
 
-    def receive(
-        self, timeout_s: float, spin_s: float = 0.0, sleep_s: float = 0.0, until: int | None = None
-    ) -> list[Frame]:
+    def receive(self, timeout_s: float, spin_s: float = 0.0, until: int | None = None) -> list[Frame]:
         """Wait for the link at most this long, then return every good frame that is there, in the order of arrival.
 
         An empty list may come early (garbage, foreign senders, a line that fell silent): the caller watches the clock
@@ -154,7 +152,6 @@ class Wire:
             spin_s: look without sleeping for this long first: an answer that is due in less is not worth going to sleep
                 for, which costs more than the wait itself. For a vehicle in lockstep: what was found this way is one
                 datagram, after which nothing comes before it is answered.
-            sleep_s: before that, sleep for this long at most, exactly; what comes meanwhile ends it.
             until: a message: datagrams behind the newest one that begins with it are left to the next call, which does
                 not wait then. For who answers this message in a hurry.
 
@@ -171,11 +168,10 @@ class Wire:
         if self._unread:
             self._use(frames, unknown, None)
             return self._noted(frames, unknown)
-        woken = sleep_s > 0.0 and bool(select.select([self._transport.fileno()], [], [], sleep_s)[0])
-        if woken or not self._spin(spin_s, frames, unknown):
+        if not self._spin(spin_s, frames, unknown):
             if self._line is not None:
                 timeout_s = min(timeout_s, self._line.wait_s(time.monotonic_ns()))
-            if not woken and not self._poll.poll(max(0.0, timeout_s) * 1e3):
+            if not self._poll.poll(max(0.0, timeout_s) * 1e3):
                 if self._line is None:
                     return frames
                 self._rest(self._line, frames, unknown)

@@ -8,7 +8,6 @@ import os
 import pty
 import socket
 import termios
-import threading
 import time
 from typing import ClassVar
 
@@ -53,16 +52,30 @@ def listening(**options):
         yield wire, ("127.0.0.1", port)
 
 
-def test_a_wait_sleeps_first_then_looks_and_what_comes_meanwhile_ends_each():
-    with listening() as (wire, there), udp_socket() as vehicle:
+def test_what_is_behind_the_newest_state_waits_for_the_next_call():
+    taps = []
+    with (
+        listening(tap=lambda *entry: taps.append(entry)) as (wire, there),
+        udp_socket() as vehicle,
+        udp_socket() as other,
+    ):
         vehicle.sendto(heartbeat(0), there)
-        assert len(wire.receive(0.0, 0.0, 60.0)) == 1  # the sleep ends; a minute is longer than a test may take
-        later = threading.Timer(0.05, vehicle.sendto, (heartbeat(1), there))
-        later.start()
-        frames = wire.receive(0.0, 60.0, 0.001)  # it comes while nobody sleeps: there is no other wait to find it
-        later.join()
-        assert [frame.seq for frame in frames] == [1]
-        assert wire.receive(0.0, 0.001, 0.001) == []
+        assert len(wire.receive(2.0)) == 1
+        for raw in (heartbeat(1), odometry(2, 1000), heartbeat(3), odometry(4, 2000), heartbeat(5), heartbeat(6)):
+            vehicle.sendto(raw, there)
+        other.sendto(odometry(9, 9000), there)  # of somebody else: nobody hurries for it
+        first = wire.receive(2.0, until=codec.ODOMETRY)
+        assert [frame.seq for frame in first] == [1, 2, 3, 4]
+        rest = wire.receive(60.0, until=codec.ODOMETRY)  # at once: a minute is longer than a test may take
+        assert [frame.seq for frame in rest] == [5, 6]
+        assert wire.receive(0.0, until=codec.ODOMETRY) == []
+        assert wire.counters.foreign_address == 1
+        assert wire.counters.lost == {(1, 1): 0}
+        vehicle.sendto(odometry(7, 3000), there)
+        vehicle.sendto(heartbeat(8), there)
+        assert [frame.seq for frame in wire.receive(2.0)] == [7, 8]  # who does not ask for it gets all
+        wire.tell()
+        assert [entry[1][4] for entry in taps] == list(range(9))
 
 
 def collect(wire: Wire, count: int) -> list[Frame]:

@@ -16,7 +16,6 @@ import pytest
 import tomlkit
 
 from companion.config import Flight, build_flight, find, read_toml
-from companion.flight.lookout import Lookout
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.planning import Planning
@@ -56,8 +55,6 @@ class VirtualWire:
         self.stall: tuple[float, float] | None = None
         """When after OFFBOARD the companion is stopped, and for how long [s]."""
         self.dead = False
-        self.looks: list[tuple[float, float, float, float]] = []
-        """Seconds since OFFBOARD, begin and length of a look without sleeping, and when the next state came [ns]."""
         self.later: list[bytes] = []
         """What arrives on its own, after the rest."""
         self._parser = FrameParser(message_formats(), self.counters, None)
@@ -69,11 +66,7 @@ class VirtualWire:
     def offboard_s(self) -> float:
         return -math.inf if self.offboard_us is None else (self.vehicle.t_us - self.offboard_us) * 1e-6
 
-    def receive(
-        self, timeout_s: float, spin_s: float = 0.0, sleep_s: float = 0.0, until: int | None = None
-    ) -> list[Frame]:
-        if spin_s > 0.0:
-            self.looks.append((self.offboard_s, self.now_ns + 1e9 * sleep_s, 1e9 * spin_s, self._next_ns))
+    def receive(self, timeout_s: float, spin_s: float = 0.0, until: int | None = None) -> list[Frame]:
         if self.stall is not None and self.offboard_s >= self.stall[0]:
             self._advance_to(self.now_ns + int(self.stall[1] * 1e9))
             self.stall = None
@@ -180,29 +173,18 @@ def wire(make_wire: Callable[..., VirtualWire]) -> VirtualWire:
     return make_wire(((0.0, 0.0, -20.0), 0.0))
 
 
-def fly(flight: Flight, wire: VirtualWire, lookout: Lookout | None = None) -> tuple[Outcome, FlightRecord]:
+def fly(flight: Flight, wire: VirtualWire) -> tuple[Outcome, FlightRecord]:
     record = FlightRecord(2000, PHASE_NAMES)
-    loop = FlightLoop(
-        *(flight, of_flight(flight), wire, record, kernels("python")),  # type: ignore[arg-type]
-        lookout=lookout,
-    )
+    loop = FlightLoop(flight, of_flight(flight), wire, record, kernels("python"))  # type: ignore[arg-type]
     return loop.run(), record
 
 
-def test_states_are_looked_out_for_when_they_are_due(flight: Flight, make_wire: Callable[..., VirtualWire]) -> None:
-    start = (0.0, 0.0, -20.0), 0.0
-    usual = make_wire(start)
-    before = fly(flight, usual)[1]
-    looking = make_wire(start)  # the clock is that of the last one made
-    outcome, record = fly(flight, looking, Lookout(1e-9 * STATE_PERIOD_NS))
-    assert outcome.cause is Cause.COMPLETED, outcome.sentence
-    assert not usual.looks
-    flown = [look for look in looking.looks if look[0] > 0.2]
-    assert len(flown) > 50
-    assert all(begin <= due <= begin + length for _, begin, length, due in flown)
-    assert all(length < 0.1 * STATE_PERIOD_NS for _, _, length, _ in flown)
-    columns = ("p_n", "p_e", "p_d", "thrust_cmd")
-    assert (record.columns(*columns) == before.columns(*columns)).all()  # it changes how is waited, and nothing else
+def test_attitudes_that_are_never_newer_than_a_state_are_given_back_their_own_rate(
+    flight: Flight, wire: VirtualWire
+) -> None:
+    assert fly(flight, wire)[0].cause is Cause.COMPLETED
+    asked = [m for _, m in wire._of(codec.ID_COMMAND_LONG, -math.inf) if m.command == 511 and m.param1 == 31]
+    assert [m.param2 for m in asked] == [3200.0, 0.0]
 
 
 def test_whole_flight(flight: Flight, wire: VirtualWire) -> None:
