@@ -35,7 +35,7 @@ from companion.record.ulog import ULOG_FILE
 
 _REPORT = struct.Struct("=QQQ")  # datagrams in link.tlog, datagrams dropped by the child, entries not in flight.ulg
 _READY: Final = b"ready"
-_RING_BYTES: Final = 16 << 20  # a minute and more of a usual link, should the child get no processor
+_RING_BYTES: Final = 24 << 20  # a minute and a half of a usual link, should the child get no processor
 _PENDING_MAX: Final = 64 << 20  # bytes that wait for a disk that does not answer
 _FLUSH_S: Final = 0.5
 _ROUND_S: Final = 0.05
