@@ -23,7 +23,6 @@ from companion.control.types import State
 from companion.errors import LinkError
 from companion.flight.accounting import Accounting, FlownStep, Progress
 from companion.flight.adaptation import Adaptation, adapted
-from companion.flight.attitudes import Attitudes
 from companion.flight.calibration import Calibrator
 from companion.flight.clock import VehicleClock
 from companion.flight.coast import coast_setpoint
@@ -45,7 +44,7 @@ from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
 from companion.link.framing import Frame
-from companion.link.operations import DEFAULT_INTERVAL, STOP_MESSAGE, Operations
+from companion.link.operations import STOP_MESSAGE, Operations
 from companion.link.setpoint import SetpointSender, UnsendableSetpoint
 from companion.link.telemetry import StateRejection, Telemetry, VehicleState
 from companion.link.timesync import PacedPeer
@@ -69,6 +68,8 @@ GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, RC_CHANNELS, VFR_HUD, POSITION_TARGET_LOC
 lockstep they cost a third of the time."""
 ATTITUDE_INTERVAL_US = 3_200
 """Of ATTITUDE_QUATERNION, which refreshes the rotation that is predicted: PX4 has one at each of its 4 ms."""
+ANSWERED = frozenset((codec.ODOMETRY, codec.ATTITUDE_QUATERNION))
+"""What a setpoint is computed from: what comes behind the newest of them is read when that is answered."""
 LOCKSTEP_SPIN_S = 0.0005
 """A vehicle in lockstep answers within this: sleeping would cost more than the wait. Elsewhere the loop sleeps."""
 HEARTBEAT_INTERVAL_S = 1.0
@@ -135,7 +136,6 @@ class FlightLoop:
         self._only_gates = only_gates
         self._paced = paced
         self._tell_met = met
-        self._attitudes = Attitudes()
         self._autopilot = Autopilot()
         self._compiled = compiled
         self._adaptation: Adaptation | None = None
@@ -354,7 +354,7 @@ class FlightLoop:
     def _turn(self) -> None:
         self._turned_ns = time.monotonic_ns()
         spin_s = LOCKSTEP_SPIN_S if self._peer.paced else 0.0
-        for frame in self._wire.receive(self._wait_s(), spin_s, until=codec.ODOMETRY):  # that is answered before others
+        for frame in self._wire.receive(self._wait_s(), spin_s, until=ANSWERED):
             self._on_frame(frame)
         if not self._peer.paced:
             self._answer_state()
@@ -422,9 +422,6 @@ class FlightLoop:
         self._pending_wall_ns = frame.arrival_wall_ns
         self._peer.on_state(state.t_vehicle_us)
         self._clock.on_state(state.t_vehicle_us, frame.arrival_wall_ns)
-        if self._attitudes.waste(state.t_vehicle_us):
-            now_s = self._clock.now_s(frame.arrival_wall_ns)
-            self._ops.set_message_interval(codec.ATTITUDE_QUATERNION, DEFAULT_INTERVAL, now_s)
         meter = self._sequence.preflight.meter
         if meter.running:
             meter.on_state(state, self._clock.now_s(frame.arrival_wall_ns), paced=self._peer.paced)
@@ -433,7 +430,6 @@ class FlightLoop:
         """One that is newer than the state which is answered next refreshes the prediction, and asks for no answer."""
         sample = self._telemetry.on_attitude(frame)
         if not (self._peer.paced or isinstance(sample, StateRejection)):
-            self._attitudes.on_attitude(sample.t_vehicle_us)
             tracker.refresh(Attitude(sample.t_vehicle_us * 1e-6, sample.q, sample.w))
 
     def _on_timesync(self, frame: Frame) -> None:

@@ -140,7 +140,7 @@ class Wire:
         """What came and was not used because of who sent it, by reason."""
         return refusals(self.counters, self._guard)
 
-    def receive(self, timeout_s: float, spin_s: float = 0.0, until: int | None = None) -> list[Frame]:
+    def receive(self, timeout_s: float, spin_s: float = 0.0, until: frozenset[int] = frozenset()) -> list[Frame]:
         """Wait for the link at most this long, then return every good frame that is there, in the order of arrival.
 
         An empty list may come early (garbage, foreign senders, a line that fell silent): the caller watches the clock
@@ -152,8 +152,8 @@ class Wire:
             spin_s: look without sleeping for this long first: an answer that is due in less is not worth going to sleep
                 for, which costs more than the wait itself. For a vehicle in lockstep: what was found this way is one
                 datagram, after which nothing comes before it is answered.
-            until: a message: datagrams behind the newest one that begins with it are left to the next call, which does
-                not wait then. For who answers this message in a hurry.
+            until: messages: datagrams behind the newest one that begins with one of them are left to the next call,
+                which does not wait then. For who answers these messages in a hurry.
 
         Raises:
             LinkError: the serial line is gone.
@@ -166,7 +166,7 @@ class Wire:
         frames: list[Frame] = []
         unknown: list[bytes] = []
         if self._unread:
-            self._use(frames, unknown, None)
+            self._use(frames, unknown, frozenset())
             return self._noted(frames, unknown)
         if not self._spin(spin_s, frames, unknown):
             if self._line is not None:
@@ -202,15 +202,14 @@ class Wire:
                 return
             unread.append((*got, now()))
 
-    def _use(self, frames: list[Frame], unknown: list[bytes], until: int | None) -> None:
-        """Use the datagrams that were read, up to the newest of the peer's that begins with a message, if one does."""
+    def _use(self, frames: list[Frame], unknown: list[bytes], until: frozenset[int]) -> None:
+        """Use what was read, up to the newest datagram of the peer that begins with one of these messages, if any."""
         unread = self._unread
         end = len(unread)
-        if until is not None and end > 1:
-            begin = until.to_bytes(3, "little")
+        if until and end > 1:
             for i in range(end - 1, -1, -1):
                 data, address, _ = unread[i]
-                if data[_MSGID] == begin and data[0] == MAGIC_V2 and address == self.peer:
+                if address == self.peer and data[0] == MAGIC_V2 and int.from_bytes(data[_MSGID], "little") in until:
                     end = i + 1
                     break
         for data, address, wall_ns in unread[:end]:

@@ -21,6 +21,7 @@ from companion.link.transport import UdpTransport, parse_connection, port_holder
 from companion.link.wire import TAP_IN, TAP_OUT, Wire
 
 FORMATS = codec.message_formats()
+STATES = frozenset((codec.ODOMETRY, codec.ATTITUDE_QUATERNION))
 
 
 def heartbeat(seq: int, system: int = 1) -> bytes:
@@ -30,6 +31,10 @@ def heartbeat(seq: int, system: int = 1) -> bytes:
 def odometry(seq: int, t_us: int) -> bytes:
     payload = t_us.to_bytes(8, "little") + bytes(225)
     return build_frame(331, payload, seq, 1, 1, FORMATS[331].crc_extra)
+
+
+def attitude(seq: int) -> bytes:
+    return build_frame(31, bytes((1, *bytes(31))), seq, 1, 1, FORMATS[31].crc_extra)
 
 
 def udp_socket() -> socket.socket:
@@ -61,14 +66,14 @@ def test_what_is_behind_the_newest_state_waits_for_the_next_call():
     ):
         vehicle.sendto(heartbeat(0), there)
         assert len(wire.receive(2.0)) == 1
-        for raw in (heartbeat(1), odometry(2, 1000), heartbeat(3), odometry(4, 2000), heartbeat(5), heartbeat(6)):
+        for raw in (heartbeat(1), odometry(2, 1000), heartbeat(3), attitude(4), heartbeat(5), heartbeat(6)):
             vehicle.sendto(raw, there)
         other.sendto(odometry(9, 9000), there)  # of somebody else: nobody hurries for it
-        first = wire.receive(2.0, until=codec.ODOMETRY)
+        first = wire.receive(2.0, until=STATES)
         assert [frame.seq for frame in first] == [1, 2, 3, 4]
-        rest = wire.receive(60.0, until=codec.ODOMETRY)  # at once: a minute is longer than a test may take
+        rest = wire.receive(60.0, until=STATES)  # at once: a minute is longer than a test may take
         assert [frame.seq for frame in rest] == [5, 6]
-        assert wire.receive(0.0, until=codec.ODOMETRY) == []
+        assert wire.receive(0.0, until=STATES) == []
         assert wire.counters.foreign_address == 1
         assert wire.counters.lost == {(1, 1): 0}
         vehicle.sendto(odometry(7, 3000), there)

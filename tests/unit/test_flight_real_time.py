@@ -66,7 +66,7 @@ class VirtualWire:
     def offboard_s(self) -> float:
         return -math.inf if self.offboard_us is None else (self.vehicle.t_us - self.offboard_us) * 1e-6
 
-    def receive(self, timeout_s: float, spin_s: float = 0.0, until: int | None = None) -> list[Frame]:
+    def receive(self, timeout_s: float, spin_s: float = 0.0, until: frozenset[int] = frozenset()) -> list[Frame]:
         if self.stall is not None and self.offboard_s >= self.stall[0]:
             self._advance_to(self.now_ns + int(self.stall[1] * 1e9))
             self.stall = None
@@ -177,14 +177,6 @@ def fly(flight: Flight, wire: VirtualWire) -> tuple[Outcome, FlightRecord]:
     record = FlightRecord(2000, PHASE_NAMES)
     loop = FlightLoop(flight, of_flight(flight), wire, record, kernels("python"))  # type: ignore[arg-type]
     return loop.run(), record
-
-
-def test_attitudes_that_are_never_newer_than_a_state_are_given_back_their_own_rate(
-    flight: Flight, wire: VirtualWire
-) -> None:
-    assert fly(flight, wire)[0].cause is Cause.COMPLETED
-    asked = [m for _, m in wire._of(codec.ID_COMMAND_LONG, -math.inf) if m.command == 511 and m.param1 == 31]
-    assert [m.param2 for m in asked] == [3200.0, 0.0]
 
 
 def test_whole_flight(flight: Flight, wire: VirtualWire) -> None:
