@@ -192,7 +192,8 @@ class Peer:
         if self.options.lockstep:
             self._awaited_ns = t_us * 1000
             self._answered = False
-            if self._ahead_ns == self._awaited_ns:  # it is out already
+            ahead_ns, self._ahead_ns = self._ahead_ns, -1
+            if ahead_ns == self._awaited_ns:  # it is out already
                 return
             self.vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._awaited_ns, 0, 0))
         self._ticked_s = time.monotonic()

@@ -261,6 +261,7 @@ class Vehicle:
         plans, battery, was_quiet = self.autopilot.plans, self.slow.battery, self.ground.quiet
         self.keyring.boot()
         self.booting = False
+        self._told_ahead_us, self._foretold = -1, None
         self._boot_us = self.airframe.t_us - passed_us
         self._start_autopilot(in_air=False, plans=plans)
         self.slow.battery = battery
@@ -294,9 +295,10 @@ class Vehicle:
         telemetry, period_us, left = self.telemetry, self.period_us, self.steps_per_tick
         now_us = airframe.t_us - self._boot_us + period_us
         due = [self.companion.due(now_us, period_us), self.ground.due(now_us, period_us)]
+        told, self._told_ahead_us = self._told_ahead_us == now_us, -1
         early = left <= airframe.age_steps and self._tell_the_past(due)
         if early:
-            if self._told_ahead_us != now_us:
+            if not told:
                 telemetry.update(now_us, self._dated(airframe.believed(left)))
                 self._publish(due, now_us)
             queued(now_us)
@@ -310,7 +312,7 @@ class Vehicle:
             airframe.set_thrust_factor(self.slow.battery.thrust_factor)
         self.services.update(self.links, now_us)
         if not early:
-            self._publish(due, now_us)
+            self._publish([[], due[1]] if told else due, now_us)
             queued(now_us)
         if self.tells_truth and now_us >= self._truth_us:
             self._publish_truth(now_us)
@@ -359,11 +361,12 @@ class Vehicle:
     def tell_ahead(self) -> int | None:
         """Queue the messages of the next state now, if nothing that may still happen before it can change them.
 
-        That is so while the companion flies the vehicle and nothing else goes on: its setpoint acts on the motion, and
-        what is told is the past. Gives the vehicle time of that state, or None: it must wait for `tick`.
+        That is so while the companion flies the vehicle and nothing else goes on, and frames are believed as they come
+        (not signed): its setpoint acts on the motion, and what is told is the past. Gives the vehicle time of that
+        state, or None: it must wait for `tick`.
         """
         foretold, autopilot = self._foretold, self.autopilot
-        if foretold is None or not self._undisturbed():
+        if foretold is None or self.keyring.key is not None or not self._undisturbed():
             return None
         if autopilot.mode is not Mode.OFFBOARD or not (autopilot.armed and autopilot.offboard_ok):
             return None
@@ -373,7 +376,7 @@ class Vehicle:
                 return None
         for msg_id, content in foretold.messages:
             self.companion.send_hot(msg_id, content)
-        self._told_ahead_us = foretold.t_us
+        self._told_ahead_us, self._foretold = foretold.t_us, None
         return foretold.t_us
 
     def _tell_the_past(self, due: list[Sequence[int]]) -> bool:

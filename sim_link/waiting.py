@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 
 _SELECT_MAX = 1024
@@ -30,12 +31,10 @@ class Waiter:
     def wait(self, timeout_s: float) -> list[int]:
         """Wait until something is received, or for some time; gives the descriptors that have something.
 
-        It may end early with nothing, by less than a millisecond: who waits for a time looks at the clock and waits
-        again.
+        It may end early with nothing, by less than a millisecond (late, where descriptors are many): who waits for a
+        time looks at the clock and waits again.
         """
-        whole_ms = int(timeout_s * 1e3)
-        if not self._exact:
-            whole_ms += 1 if timeout_s > 0.0 else 0
-        elif whole_ms == 0 and timeout_s > 0.0:
+        if 0.0 < timeout_s < 0.001 and self._exact:
             return select.select(self._descriptors, (), (), timeout_s)[0]
+        whole_ms = int(timeout_s * 1e3) if self._exact else math.ceil(timeout_s * 1e3)
         return [descriptor for descriptor, _ in self._poll.poll(max(0, whole_ms))]

@@ -2,7 +2,7 @@
 
 It strings together the very functions that fly: `control.model.advance` and `control.law.step` on the companion's side,
 `sim_link.inner_loops.advance_step` and `sim_link.estimator.with_noise` on the vehicle's. What `flight.tracker` and
-`flight.prediction` work out from time stamps is constant here, because states come at equal intervals: which commands
+`control.history` work out from time stamps is constant here, because states come at equal intervals: which commands
 act in which piece of the prediction is a table of weights. Plain Python with lists, or compiled with arrays
 (`companion.accelerate`): the same source.
 
@@ -72,7 +72,7 @@ class Clock(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What `flight.prediction` amounts to at equal intervals."""
+    """What `control.history` amounts to at equal intervals."""
 
     pieces: int
     """Number of pieces; the weights are pieces rows over `history` commands, the newest first."""

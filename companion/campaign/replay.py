@@ -23,7 +23,7 @@ from companion.control.types import State
 from companion.errors import InputError
 from companion.flight.adaptation import adapted
 from companion.flight.controller import controller_of
-from companion.flight.course import ZERO, Course
+from companion.flight.course import ZERO, Course, Timed
 from companion.flight.phases import Engagement
 from companion.flight.tracker import Kernels, Tracker
 from companion.record.flight_record import FlightRecord
@@ -124,7 +124,7 @@ def replay(
     delays = list(engagement.delays) if changed is None else []
     resets = list(engagement.resets)
     rows = record.rows
-    begin_s = engagement.at_s
+    reference_at = Timed(course, engagement.at_s)
     tracker.begin(State(ZERO, ZERO, engagement.attitude, ZERO), engagement.thrust_n)
     replayed = {column: np.full(len(rows), np.nan) for _, columns in COMMANDS.values() for column in columns}
     table = np.column_stack([rows[:, 0], record.columns(*_STATE)])
@@ -138,14 +138,14 @@ def replay(
         while resets and stamp_s >= resets[0].at_s:
             course.shift(resets[0].moved_m)
             tracker.carry(resets.pop(0))
-        out = tracker.step(stamp_s, state, lambda t: course.at(t - begin_s))
+        out = tracker.step(stamp_s, state, reference_at)
         n = out.numbers
         values = (thrust_of(out.setpoint), n[flat.TOTAL], *n[flat.RATES], *n[flat.TAU], *n[flat.B_HAT])
         for column, value in zip(replayed, values, strict=True):
             replayed[column][index] = value
         if index % _PROGRESS_ROWS == 0:
             progress(index / len(rows))
-    return Replay(flight, record, replayed, rows[:, 0] - begin_s)
+    return Replay(flight, record, replayed, rows[:, 0] - engagement.at_s)
 
 
 _STATE: Final = ("p_n", "p_e", "p_d", "v_n", "v_e", "v_d", "q_w", "q_x", "q_y", "q_z", "w_x", "w_y", "w_z")

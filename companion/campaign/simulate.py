@@ -25,7 +25,7 @@ from companion.control.law import ControllerState
 from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, PositionSetpoint, Setpoint
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.errors import InputError, RefusedError
-from companion.flight.course import Course
+from companion.flight.course import Course, Timed
 from companion.flight.phases import PHASE_INDEX, PHASE_NAMES, Phase
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.tracker import Kernels, Tracker, TrackerStep
@@ -159,6 +159,7 @@ def fly_sampled(
     acting = loop_setpoint(_hover(flight))
     delay_us = round(vehicle.link.command_delay_s * 1e6)
     rows: list[Row] = []
+    reference_at = Timed(course, begin_s)
     for i in range(count):
         believed = airframe.believed()
         stamp_s = believed.t_us * 1e-6
@@ -166,7 +167,7 @@ def fly_sampled(
             airframe.advance(acting, False, n_steps)
             continue
         state = State(believed.p, believed.v, believed.q, believed.w)
-        out = tracker.step(stamp_s, state, lambda t: course.at(t - begin_s))
+        out = tracker.step(stamp_s, state, reference_at)
         queue.append((airframe.t_us + delay_us, loop_setpoint(out.setpoint)))
         _append(record, rows, out, stamp_s, stamp_s - begin_s, state, course)
         size = math.hypot(*out.errors[0])

@@ -19,7 +19,7 @@ from companion.config import Flight
 from companion.control import flat
 from companion.control.output import RateSetpoint, thrust_fraction
 from companion.control.types import GRAVITY_M_S2, State
-from companion.flight.course import Course
+from companion.flight.course import Course, Timed
 from companion.flight.following import Following
 from companion.flight.guards import Guards, Response
 from companion.flight.tracker import Kernels, Tracker
@@ -129,6 +129,7 @@ def fly_starved(
     begin_s, dt_s = airframe.t_us * 1e-6, airframe.dt_us * 1e-6
     period_s = 1.0 / vehicle.link.state_rate_hz
     process = _Process(starvation, begin_s, period_s, seed)
+    reference_at = Timed(course, begin_s)
     command_s = vehicle.link.command_delay_s
     waiting: list[tuple[float, inner_loops.Setpoint]] = []
     weight = thrust_fraction(vehicle.body.mass_kg * GRAVITY_M_S2, vehicle.thrust_full_n, vehicle.rotors.curve_factor)
@@ -150,7 +151,7 @@ def fly_starved(
             answered_s = sent_s = stamp_s
             steps += 1
             state = State(believed.p, believed.v, believed.q, believed.w)
-            out = tracker.step(stamp_s, state, lambda t: course.at(t - begin_s))
+            out = tracker.step(stamp_s, state, reference_at)
             waiting.append((goes_s + command_s, loop_setpoint(out.setpoint)))
             wanted = course.at(stamp_s - begin_s).p
             error = (state.p[0] - wanted[0], state.p[1] - wanted[1], state.p[2] - wanted[2])

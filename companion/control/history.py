@@ -147,6 +147,8 @@ def gather(h: MutableSequence[float], stamp_s: float, out: MutableSequence[float
                 return count
             thrust = x = y = z = 0.0
             at_s, edge_s = edge_s, edge_s + length_s
+        if i >= end:  # not with finite times: what comes last acts for ever
+            return done
         share_s = until_s - at_s
         if share_s > 0.0:
             thrust += share_s * t

@@ -2,8 +2,8 @@
 of.
 
 First-order body rates and thrust behind their setpoints, the rigid body of docs/law.md section 1 with drag and the
-estimated disturbance. A kernel; `companion.flight.prediction` strings the pieces together, and the certificate
-linearises the very same function.
+estimated disturbance. A kernel; `companion.control.history` gives the pieces that the steps of a flight run through,
+and the certificate linearises the very same function.
 """
 
 from __future__ import annotations

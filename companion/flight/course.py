@@ -200,9 +200,9 @@ class Course:
             self.curve[MOVED : MOVED + 3] = self.moved_m
 
     @property
-    def steady(self) -> bool:
-        """Whether it has had its own pace from the beginning."""
-        return self._tempo.steady
+    def changes_s(self) -> float:
+        """Time since engaging at which its pace changes first [s]; infinity: it was never changed."""
+        return self._tempo.changes_s
 
     def _at_own_pace(self, course_s: float) -> Reference:
         on_track_s = course_s - self.join_s
@@ -264,11 +264,14 @@ class Timed:
         return self.course.at(t_s - self.begin_s)
 
     def curve(self, stamp_s: float, delay_s: float) -> NDArray[np.float64] | None:
-        """The curve that gives the reference at a stamp and a delay later [s], where one does; else None."""
-        course = self.course
-        if course.curve is None or not course.steady or stamp_s - self.begin_s - self.join_s < 0.0:
+        """The curve that gives the reference at a stamp and a delay later [s], where one does; else None.
+
+        It goes by the times alone: a replay, which knows all changes of the pace from its beginning, takes the same.
+        """
+        course, effect_s = self.course, stamp_s + delay_s - self.begin_s
+        if course.curve is None or stamp_s - self.begin_s - self.join_s < 0.0 or effect_s >= course.changes_s:
             return None
-        return course.curve if stamp_s + delay_s - self.begin_s - self.join_s <= course.track_s else None
+        return course.curve if effect_s - self.join_s <= course.track_s else None
 
 
 class _OwnPace:

@@ -69,7 +69,8 @@ lockstep they cost a third of the time."""
 ATTITUDE_INTERVAL_US = 3_200
 """Of ATTITUDE_QUATERNION, which refreshes the rotation that is predicted: PX4 has one at each of its 4 ms."""
 ANSWERED = frozenset((codec.ODOMETRY, codec.ATTITUDE_QUATERNION))
-"""What a setpoint is computed from: what comes behind the newest of them is read when that is answered."""
+"""What a setpoint is computed from: what comes behind the newest of them is read when that is answered. So a change of
+the mode that came together with a state, and behind it, is known one setpoint later."""
 LOCKSTEP_SPIN_S = 0.0005
 """A vehicle in lockstep answers within this: sleeping would cost more than the wait. Elsewhere the loop sleeps."""
 HEARTBEAT_INTERVAL_S = 1.0
@@ -354,7 +355,8 @@ class FlightLoop:
     def _turn(self) -> None:
         self._turned_ns = time.monotonic_ns()
         spin_s = LOCKSTEP_SPIN_S if self._peer.paced else 0.0
-        for frame in self._wire.receive(self._wait_s(), spin_s, until=ANSWERED):
+        hurries_for = frozenset[int]() if self._peer.paced else ANSWERED
+        for frame in self._wire.receive(self._wait_s(), spin_s, until=hurries_for):
             self._on_frame(frame)
         if not self._peer.paced:
             self._answer_state()

@@ -43,7 +43,8 @@ class Prediction:
         self._gather = accelerate.choose(history.gather, engine)
         self._begin(self.numbers, thrust_n, thrust_lag_s)
         self.retime(max(delay_s, PIECE_MAX_S))
-        self.pieces(0.0)  # whatever is compiled is compiled now
+        self.pieces(0.0)
+        self.sent(0.0, thrust_n, (0.0, 0.0, 0.0))  # whatever is compiled is compiled now
         self.begin(thrust_n)
         self.retime(delay_s)
 

@@ -63,6 +63,11 @@ class Tempo:
         """Whether the pace was never changed."""
         return not self._spans
 
+    @property
+    def changes_s(self) -> float:
+        """Time since engaging at which the pace changes first [s]; infinity: it was never changed."""
+        return self._spans[0].ramp.begin_s if self._spans else math.inf
+
     def at(self, t_s: float) -> Pace:
         """The pace at a time since engaging [s]."""
         for span in reversed(self._spans):

@@ -1,8 +1,8 @@
 """One control step as every flight makes it: predict, evaluate the law at the time of effect, remember what was sent.
 
 The same object flies over MAVLink (`flight.loop`) and in `companion simulate`; it knows nothing of sockets. Its time is
-the vehicle's. The arithmetic is `control.model.advance` and `control.law.step` with either engine: called as they are,
-or compiled as one kernel.
+the vehicle's. The arithmetic is `control.history`, `control.model.advance` and `control.law.step` with either engine:
+called as they are, or compiled as one kernel (`flight.fused`).
 """
 
 from __future__ import annotations

@@ -40,6 +40,7 @@ COMPANION_COMPONENT: Final = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _AUTOPILOT_COMPONENT: Final = 1
 _READS_MAX = 256
 _MSGID = slice(7, 10)
+_V2 = bytes((MAGIC_V2,))
 _DATAGRAM_MAX = 1400
 """Several frames in one datagram stay within what a network takes whole."""
 _UNTOLD_MAX = 1000
@@ -153,7 +154,7 @@ class Wire:
                 for, which costs more than the wait itself. For a vehicle in lockstep: what was found this way is one
                 datagram, after which nothing comes before it is answered.
             until: messages: datagrams behind the newest one that begins with one of them are left to the next call,
-                which does not wait then. For who answers these messages in a hurry.
+                which does not wait then. For who answers these messages in a hurry; nothing is left on a serial line.
 
         Raises:
             LinkError: the serial line is gone.
@@ -209,7 +210,7 @@ class Wire:
         if until and end > 1:
             for i in range(end - 1, -1, -1):
                 data, address, _ = unread[i]
-                if address == self.peer and data[0] == MAGIC_V2 and int.from_bytes(data[_MSGID], "little") in until:
+                if address == self.peer and data[:1] == _V2 and int.from_bytes(data[_MSGID], "little") in until:
                     end = i + 1
                     break
         for data, address, wall_ns in unread[:end]:
@@ -419,7 +420,12 @@ class Wire:
         return self._transport.fileno()
 
     def close(self) -> None:
-        """Close the link."""
+        """Close the link; what was read and not used yet is in the log, too."""
+        if self._unread:
+            frames: list[Frame] = []
+            unknown: list[bytes] = []
+            self._use(frames, unknown, frozenset())
+            self._noted(frames, unknown)
         self.tell()
         self._transport.close()
         if self._owned is not None:

@@ -32,19 +32,20 @@ def ordered(stand: Stand, plan: Plan, refusals: list[str]) -> Callable[[FlightLo
     return prepare
 
 
-def fly(folder: Path, plan: Plan, **changes: Any) -> tuple[Flown, Stand]:
+def fly(folder: Path, plan: Plan, engine: str = "python", **changes: Any) -> tuple[Flown, Stand]:
     flight = make_flight(**changes)
     refusals: list[str] = []
     with Stand(flight, folder) as stand:
-        flown = stand.fly(ordered(stand, plan, refusals))
+        flown = stand.fly(ordered(stand, plan, refusals), engine=engine)
         assert refusals == [""] * len(plan)
     return flown, stand
 
 
-def test_pause_and_resume_in_the_air(tmp_path: Path) -> None:
+@pytest.mark.parametrize("engine", ["python", pytest.param("numba", marks=pytest.mark.numba)])
+def test_pause_and_resume_in_the_air(tmp_path: Path, engine: str) -> None:
     plan = [(2.0, Order.PAUSE), (7.0, Order.RESUME)]
     trajectory = dict(INDOOR) | {"join": "law"}
-    flown, stand = fly(tmp_path, plan, trajectory=trajectory)
+    flown, stand = fly(tmp_path, plan, engine, trajectory=trajectory)
     assert (flown.cause, flown.phases[-4:]) == (Cause.COMPLETED, ["track", "pause", "track", "hold"])
     record = flown.record
     first = int(np.argmax(record.in_phase("pause")))
@@ -58,10 +59,10 @@ def test_pause_and_resume_in_the_air(tmp_path: Path) -> None:
     assert np.linalg.norm(reference, axis=1)[record.in_phase("pause")].min() == 0.0
     assert math.isclose(flown.summary["duration_s"], 6.0, abs_tol=0.03)
     assert [code for _, code in stand.mode_requests(-1.0)][-2:] == [OFFBOARD, HOLD]
-    check_replay(tmp_path, flown)
+    check_replay(tmp_path, flown, engine)
 
 
-def check_replay(folder: Path, flown: Flown) -> None:
+def check_replay(folder: Path, flown: Flown, engine: str) -> None:
     """The record holds the changes of pace: its commands can be computed again to the last bit."""
     assert flown.outcome.engagement is not None
     assert [ramp.rate for ramp in flown.outcome.engagement.ramps] == [0.0, 1.0]
@@ -70,7 +71,7 @@ def check_replay(folder: Path, flown: Flown) -> None:
     write_configuration(out, make_flight(trajectory=dict(INDOOR) | {"join": "law"}).model_dump(exclude_none=True))
     write_summary(out, flown.summary | {"engagement": asdict(flown.outcome.engagement)})
     flown.record.save(out)
-    assert replay(out, kernels("python")).identical
+    assert replay(out, kernels(engine)).identical
 
 
 def test_stop_on_the_way(tmp_path: Path) -> None:

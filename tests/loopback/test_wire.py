@@ -79,8 +79,11 @@ def test_what_is_behind_the_newest_state_waits_for_the_next_call():
         vehicle.sendto(odometry(7, 3000), there)
         vehicle.sendto(heartbeat(8), there)
         assert [frame.seq for frame in wire.receive(2.0)] == [7, 8]  # who does not ask for it gets all
-        wire.tell()
-        assert [entry[1][4] for entry in taps] == list(range(9))
+        for raw in (b"", odometry(9, 4000), b"", heartbeat(10)):  # an empty datagram is one, too
+            vehicle.sendto(raw, there)
+        assert [frame.seq for frame in wire.receive(2.0, until=STATES)] == [9]
+    # what was not used when the link was closed is in the log all the same
+    assert [entry[1][4] for entry in taps] == list(range(11))
 
 
 def collect(wire: Wire, count: int) -> list[Frame]:

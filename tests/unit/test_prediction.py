@@ -88,14 +88,15 @@ def test_without_delay_nothing_is_predicted():
     assert len(prediction.pieces(1.01)) == 0
 
 
-def test_a_history_that_overflows_forgets_its_oldest_and_one_that_goes_on_stays_small():
-    full = Prediction(0.05, 0.5, 10.0)
+@pytest.mark.parametrize("engine", ["python", pytest.param("numba", marks=pytest.mark.numba)])
+def test_a_history_that_overflows_forgets_its_oldest_and_one_that_goes_on_stays_small(engine):
+    full = Prediction(0.05, 0.5, 10.0, engine)
     for i in range(3000):  # all of them are still to act
         full.sent(1e-4 * i, float(i), (0.0, 0.0, 0.0))
     spans = full.between(0.0, 10.0)
     assert [thrust for thrust, _, _ in spans][-3:] == [2997.0, 2998.0, 2999.0]
     assert len(spans) == (history.CAPACITY - history.COMMANDS) // history.COMMAND
-    going_on, most = Prediction(0.05, 0.04, 10.0), 0
+    going_on, most = Prediction(0.05, 0.04, 10.0, engine), 0
     for i in range(3000):
         going_on.pieces(0.004 * i)
         going_on.sent(0.004 * i, float(i), (0.0, 0.0, 0.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import socket
+from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -75,9 +76,14 @@ def test_messages_of_the_present_wait_for_the_move() -> None:
     assert all(any(frame.msg_id == ID_ATTITUDE_TARGET for raw in tick for frame in frames(raw)) for tick in out)
 
 
-def flown(states: int, *, hurries: bool) -> tuple[bytes, object, int]:
-    """Fly in lockstep with a companion of few words; gives what it received, the truth, and the states told ahead."""
-    v = in_air()
+def flown(
+    states: int, *, hurries: bool, happens: Mapping[int, Callable[[Vehicle], object]] | None = None, **options: object
+) -> tuple[bytes, object, int]:
+    """Fly in lockstep with a companion of few words; gives what it received, the truth, and the states told ahead.
+
+    happens: what is done to the vehicle before which state, when the state may be out already.
+    """
+    v = in_air(**options)
     ahead = [0]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as companion:
         companion.bind(("127.0.0.1", 0))
@@ -94,23 +100,26 @@ def flown(states: int, *, hurries: bool) -> tuple[bytes, object, int]:
         heard, encoder = b"", Encoder(1, 191)
         try:
             for k in range(states):
+                if happens and k in happens:
+                    happens[k](v)
                 peer._advance()
-                asked = None
-                while asked is None:
-                    datagram = companion.recv(2048)
-                    heard += datagram
-                    asked = next((timesync(f.payload)[1] for f in frames(datagram) if f.msg_id == ID_TIMESYNC), None)
                 if k == 200:
                     assert v.autopilot.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
-                thrust = 0.5 + 0.2 * math.sin(0.1 * k)
-                setpoint = (0, 1.0, 0.0, 0.0, 0.0, 0.1, -0.05, 0.02, thrust, 1, 1, 128, 0.0, 0.0, 0.0)
-                answer = encoder.hot(ID_SET_ATTITUDE_TARGET, SET_ATTITUDE_TARGET.pack(*setpoint))
-                if k % 50 == 7:  # somebody asks for something now and then
-                    answer += encoder.cold(mavlink.MAVLink_param_request_read_message(1, 1, b"MC_ROLL_P", -1))
-                answer += encoder.hot(ID_TIMESYNC, TIMESYNC.pack(asked + 1, asked, 1, 1))
-                companion.sendto(answer, ("127.0.0.1", peer.companion.port))
-                peer._spin(5.0)
-                assert peer._answered
+                while not peer._answered:  # of a state from before a reboot the answer does not count
+                    asked = None
+                    while asked is None:
+                        datagram = companion.recv(2048)
+                        heard += datagram
+                        found = frames(datagram)
+                        asked = next((timesync(f.payload)[1] for f in found if f.msg_id == ID_TIMESYNC), None)
+                    thrust = 0.5 + 0.2 * math.sin(0.1 * k)
+                    setpoint = (0, 1.0, 0.0, 0.0, 0.0, 0.1, -0.05, 0.02, thrust, 1, 1, 128, 0.0, 0.0, 0.0)
+                    answer = encoder.hot(ID_SET_ATTITUDE_TARGET, SET_ATTITUDE_TARGET.pack(*setpoint))
+                    if k % 50 == 7:  # somebody asks for something now and then
+                        answer += encoder.cold(mavlink.MAVLink_param_request_read_message(1, 1, b"MC_ROLL_P", -1))
+                    answer += encoder.hot(ID_TIMESYNC, TIMESYNC.pack(asked + 1, asked, 1, 1))
+                    companion.sendto(answer, ("127.0.0.1", peer.companion.port))
+                    peer._spin(0.2)
                 peer._flush()
         finally:
             peer.close()
@@ -124,6 +133,37 @@ def test_states_told_before_the_setpoint_is_acted_on_are_the_same() -> None:
     assert none == 0
     assert hurried == usual
     assert hurried_truth == usual_truth
+
+
+def test_a_state_told_ahead_is_not_told_again_when_a_ground_station_asks_for_the_present() -> None:
+    def asks(v: Vehicle) -> None:
+        v.ground.speak()
+        assert v.ground.set_interval(ID_ATTITUDE_TARGET, 1, v.t_us)
+
+    hurried, hurried_truth, ahead = flown(400, hurries=True, happens={300: asks})
+    usual, usual_truth, _ = flown(400, hurries=False, happens={300: asks})
+    assert 50 < ahead < 110
+    assert (hurried, hurried_truth) == (usual, usual_truth)
+
+
+def test_a_time_that_comes_again_after_a_reboot_is_told_again() -> None:
+    def reboots(v: Vehicle) -> None:
+        assert v.autopilot.set_mode(Mode.HOLD) is Result.ACCEPTED
+        v.finish_boot(v.t_us - 20 * v.period_us)
+        v.companion.set_interval(ID_ODOMETRY, 1, v.t_us)
+
+    heard, _, ahead = flown(340, hurries=True, happens={300: reboots})
+    assert ahead > 50
+    states = [frame for frame in frames(heard) if frame.msg_id in (ID_ODOMETRY, ID_TIMESYNC)]
+    assert [f.msg_id for f in states[-60:]] == [ID_ODOMETRY, ID_TIMESYNC] * 30
+
+
+def test_where_messages_are_signed_no_state_is_told_before_the_answer_was_verified() -> None:
+    v = in_air(signing_key=bytes(range(32)))
+    v.tick()
+    v.look_ahead()
+    assert v.autopilot.set_mode(Mode.OFFBOARD) is not None
+    assert v.tell_ahead() is None
 
 
 @pytest.mark.parametrize("wanted", [True, False])

@@ -35,12 +35,21 @@ def test_both_engines_give_the_same_numbers(output, heading):
     rng = random.Random(heading + output)
     for tracker in trackers:
         tracker.begin(State((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    stamp = 1.0
-    for i in range(300):
+    stamp, asked = 1.0, 0
+    for i in range(400):
         # steps of every kind: near and far, limits, short and too long gaps, frozen
         stamp += 0.5 if i % 97 == 96 else rng.choice([0.004, 0.004, 0.008, 0.02])
         state = random_state(rng, rng.choice([0.5, 4.0, 40.0]))
         frozen = i % 13 == 0
+        if i == 120:  # the flight begins anew, on another course
+            course = Course(load("paper"), vehicle, (1.0, 2.0, -12.0), 0.3, None)
+            for t in trackers:
+                t.begin(state, 20.0)
+        if i == 260:  # paused: the curve is left when the pace changes
+            plan = course.plan_pace(stamp - 1.5 + 0.6, 0.0)
+            ramp = plan.work(plan.samples_max)
+            assert ramp is not None
+            course.change_pace(ramp)
         if i == 200:  # the estimate was reset: from here on all of the course is elsewhere
             course.shift((0.3, -0.2, 0.1))
         if i % 3 == 0:  # of before or after the state, near its attitude or not
@@ -52,10 +61,10 @@ def test_both_engines_give_the_same_numbers(output, heading):
             for t in trackers:
                 t.retime(delay_s)
         # the plain one asks the course; the compiled one has the trajectory as numbers, and asks before it begins
-        plain = trackers[0].step(stamp, state, lambda s: course.at(s - 1.5), frozen=frozen)
+        plain = trackers[0].step(stamp, state, lambda s, c=course: c.at(s - 1.5), frozen=frozen)
         compiled = trackers[1].step(stamp, state, Timed(course, 1.5), frozen=frozen)
         at_stamp = course.at(stamp - 1.5)
-        assert (compiled.target is not None) == (stamp >= 1.5)
+        assert (compiled.target is not None) == (1.5 <= stamp < 1.5 + course.changes_s - trackers[1].delay_s)
         if compiled.target is not None:
             assert compiled.target.p == pytest.approx(at_stamp.p, abs=1e-12)
             assert compiled.target.v == pytest.approx(at_stamp.v, abs=1e-12)
@@ -63,7 +72,9 @@ def test_both_engines_give_the_same_numbers(output, heading):
         for a, b, size in zip(plain.numbers, compiled.numbers, scale, strict=True):
             assert a == pytest.approx(b, abs=1e-12 * size, nan_ok=True)
         assert plain.setpoint[0] == pytest.approx(compiled.setpoint[0], abs=1e-12)
+        asked += compiled.target is None
     assert trackers[0].refreshed == trackers[1].refreshed > 10
+    assert 60 < asked < 200
 
 
 def test_a_gap_is_not_integrated_over():
