@@ -257,7 +257,7 @@ class TurnWire(Wire):
         super().__init__(open_transport(f"udpin:127.0.0.1:{stage.port}"))
         self._stage = stage
 
-    def receive(self, timeout_s: float, spin_s: float = 0.0) -> list[Frame]:
+    def receive(self, timeout_s: float, spin_s: float = 0.0, until: frozenset[int] = frozenset()) -> list[Frame]:
         """What is there after the vehicle's turn."""
         self._stage.turn()
         return super().receive(0.0, 0.0)
