@@ -143,6 +143,7 @@ class Ready:
         def pace(waits: bool) -> None:
             if waits:
                 self.recorder.give_way()
+                self.record.sink = self.recorder.offer_row_in_lockstep
                 take_core_of_two(parse_connection(connection).number)
             else:  # in lockstep it would be taken from the vehicle, for which both wait
                 take_priority()

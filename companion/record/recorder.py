@@ -41,6 +41,11 @@ _FLUSH_S: Final = 0.5
 _ROUND_S: Final = 0.05
 _START_TIMEOUT_S: Final = 20.0
 _NICE: Final = 10
+_LOOK_EVERY: Final = 256  # rows
+_NEARLY_FULL: Final = 0.875
+_ROOM_AGAIN: Final = 0.5
+_WAIT_MAX_S: Final = 0.5
+_WAIT_STEP_S: Final = 0.01
 _ROW: Final = int(Entry.ROW)
 _DIRECTIONS: Final = {int(Direction.IN), int(Direction.OUT)}
 _FAILED_TLOG: Final = 64  # bits of the exit code; the interpreter's own failures are 1 and 2
@@ -56,6 +61,8 @@ class Recorder:
         self._writer = writer
         self._closed = False
         self._lost = 0
+        self._rows = 0
+        self._stuck = False
         self.offer: Callable[[int, bytes, int], object] = writer.put
         """Hand over one datagram (on a serial line: whole frames). Never blocks, never raises for a lost one.
 
@@ -134,6 +141,19 @@ class Recorder:
     def offer_row(self, row: bytes) -> None:
         """Hand over the bytes of a row of the flight's record, as `FlightRecord.sink` gives them. Never blocks."""
         self.offer(_ROW, row, 0)
+
+    def offer_row_in_lockstep(self, row: bytes) -> None:
+        """The same where the vehicle waits for us: a ring that is nearly full is waited for, and nothing is missing.
+
+        For half a second at most, which the vehicle bears, and not again where the child has taken nothing meanwhile.
+        """
+        self.offer(_ROW, row, 0)
+        self._rows += 1
+        if self._rows % _LOOK_EVERY == 0 and self._writer.used > _NEARLY_FULL and not self._stuck:
+            taken, end_s = self._writer.taken, time.monotonic() + _WAIT_MAX_S
+            while self._writer.used > _ROOM_AGAIN and time.monotonic() < end_s:
+                time.sleep(_WAIT_STEP_S)
+            self._stuck = self._writer.taken == taken
 
     def note(self, text: str, level: int = Level.NOTICE) -> None:
         """Hand over a line for the log: what happened to the flight. Never blocks; the time is that of the traffic."""

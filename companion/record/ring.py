@@ -138,6 +138,11 @@ class RingWriter(_Ring):
         self._until = 0
 
     @property
+    def used(self) -> float:
+        """Share of the ring that the reader has not taken."""
+        return (self._before + self._at - self._numbers[_READ]) / self._size
+
+    @property
     def waiting(self) -> int:
         """Entries that the reader has not taken."""
         done, end, count = self._numbers[_READ], self._before + self._at, 0

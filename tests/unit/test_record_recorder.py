@@ -114,6 +114,36 @@ def test_one_that_gives_way_writes_everything_at_the_end(tmp_path, recorder):
     assert len(list(read_tlog(tmp_path / "link.tlog"))) == 50
 
 
+def test_in_lockstep_a_ring_that_is_nearly_full_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.record.recorder._RING_BYTES", 4 << 20)
+    monkeypatch.setattr("companion.record.recorder._WAIT_MAX_S", PATIENCE_S)  # a busy machine
+    content = struct.pack(f"={len(COLUMNS)}d", *range(len(COLUMNS)))
+    for name, waits in (("waits", True), ("does-not", False)):
+        folder = tmp_path / name
+        folder.mkdir()
+        recorder = Recorder.start(folder)
+        recorder.give_way()
+        offer = recorder.offer_row_in_lockstep if waits else recorder.offer_row
+        for _ in range(20_000):  # two rings and a half
+            offer(content)
+        recorder.close()
+        assert (recorder.dropped == 0, recorder.problem is None) == (waits, waits)
+
+
+def test_in_lockstep_a_recorder_that_takes_nothing_is_waited_for_once(monkeypatch, recorder):
+    monkeypatch.setattr("companion.record.recorder._WAIT_MAX_S", 0.05)
+    sleeps, real = [], time.sleep
+    monkeypatch.setattr("companion.record.recorder.time.sleep", lambda s: sleeps.append(s) or real(s))
+    recorder._process.send_signal(signal.SIGSTOP)
+    recorder.give_way()
+    content = bytes(8 * len(COLUMNS))
+    for _ in range(10_000):  # five times what the ring holds
+        recorder.offer_row_in_lockstep(content)
+    assert 1 <= len(sleeps) <= 6
+    assert recorder.dropped > 0
+    recorder._process.send_signal(signal.SIGCONT)
+
+
 def test_signals_that_end_a_command_do_not_end_the_recorder(tmp_path, recorder):
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         recorder._process.send_signal(number)
