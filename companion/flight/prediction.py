@@ -76,14 +76,13 @@ class Prediction:
         """Remembers a command (thrust [N], body rates [rad/s]) computed from the state stamped `stamp_s`."""
         self._remember(self.numbers, stamp_s + self.delay_s, thrust_n, rates[0], rates[1], rates[2])
 
-    def follow(self, stamp_s: float) -> float:
-        """The thrust that acts at a stamp [N]; commands that have ceased to act by then are forgotten."""
+    def follow(self, stamp_s: float) -> None:
+        """Brings `thrust` to a stamp [s]; commands that have ceased to act by then are forgotten."""
         self._follow(self.numbers, stamp_s)
-        return self.thrust
 
     def pieces(self, stamp_s: float) -> Sequence[float]:
         """What acts from a stamp until its own command will, `history.PIECE` numbers each; empty without a delay."""
-        self._follow(self.numbers, stamp_s)
+        self.follow(stamp_s)
         return self._out[: history.PIECE * self._gather(self.numbers, stamp_s, self._out, 0)]
 
     def between(self, begin_s: float, end_s: float) -> list[Span]:

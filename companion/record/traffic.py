@@ -11,6 +11,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 
+from companion.control.types import new_record
 from companion.frames import yaw_from_quat
 from companion.link import codec
 from companion.link.framing import Frame
@@ -379,6 +380,5 @@ def _frame(raw: bytes, wall_ns: int) -> Frame:
     if raw[0] == _V2:
         msgid = raw[7] | raw[8] << 8 | raw[9] << 16
         payload = raw[_PAYLOAD_V2 : _PAYLOAD_V2 + raw[1]]
-        # A NamedTuple's own constructor takes three times as long.
-        return tuple.__new__(Frame, (msgid, raw[5], raw[6], raw[4], payload, raw, wall_ns))
+        return new_record(Frame, (msgid, raw[5], raw[6], raw[4], payload, raw, wall_ns))
     return Frame(raw[5], raw[3], raw[4], raw[2], _payload(raw), raw, wall_ns)

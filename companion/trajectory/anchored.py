@@ -141,13 +141,13 @@ class Anchored:
             p = (r.p[0] + x, r.p[1] + y, r.p[2] + z)
             return Reference(p, r.v, r.a, r.j, r.s, r.yaw, r.yaw_rate, r.yaw_acceleration)
         c, s = self.cos_yaw, self.sin_yaw
-        p = _rotated(c, s, r.p)
+        p = rotated(c, s, r.p)
         return Reference(
             (p[0] + x, p[1] + y, p[2] + z),
-            _rotated(c, s, r.v),
-            _rotated(c, s, r.a),
-            _rotated(c, s, r.j),
-            _rotated(c, s, r.s),
+            rotated(c, s, r.v),
+            rotated(c, s, r.a),
+            rotated(c, s, r.j),
+            rotated(c, s, r.s),
             r.yaw + self.yaw_rad,
             r.yaw_rate,
             r.yaw_acceleration,
@@ -168,7 +168,7 @@ def anchored(trajectory: Trajectory, hold_point: Vec3, home_point: Vec3 | None) 
     yaw_rad = trajectory.anchor_yaw_rad
     c, s = cos(yaw_rad), sin(yaw_rad)
     if trajectory.anchor == "here":
-        start = _rotated(c, s, trajectory.at(0.0).p)
+        start = rotated(c, s, trajectory.at(0.0).p)
         offset_m = (hold_point[0] - start[0], hold_point[1] - start[1], hold_point[2] - start[2])
     elif trajectory.anchor == "home":
         if home_point is None:
@@ -190,6 +190,6 @@ def anchored(trajectory: Trajectory, hold_point: Vec3, home_point: Vec3 | None) 
     )
 
 
-def _rotated(c: float, s: float, vector: Vec3) -> Vec3:
+def rotated(c: float, s: float, vector: Vec3) -> Vec3:
     """Rotate about the vertical (down) axis, north to east."""
     return c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2]

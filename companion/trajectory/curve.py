@@ -11,9 +11,9 @@ import math
 from collections.abc import Sequence
 
 from companion.control.types import Reference, Vec3
-from companion.trajectory.anchored import Anchored
+from companion.trajectory.anchored import Anchored, rotated
 from companion.trajectory.piecewise import TERMS, Piecewise
-from companion.trajectory.polynomial import evaluate
+from companion.trajectory.polynomial import Derivatives, evaluate, of_axes
 from companion.trajectory.shapes import ZERO, Circle, Helix, Hover, Lemniscate, Lissajous, Shape
 from companion.trajectory.timing import scaled
 
@@ -108,35 +108,23 @@ def on_curve(r: Sequence[float], t_s: float) -> Reference:
     p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
     if r[YAW] != 0.0:
         cos, sin = r[COS], r[SIN]
-        p, v, a = _turned(cos, sin, p), _turned(cos, sin, v), _turned(cos, sin, a)
-        j, s = _turned(cos, sin, j), _turned(cos, sin, s)
+        p, v, a = rotated(cos, sin, p), rotated(cos, sin, v), rotated(cos, sin, a)
+        j, s = rotated(cos, sin, j), rotated(cos, sin, s)
         yaw += r[YAW]
     p = (p[0] + r[OFFSET] + r[MOVED], p[1] + r[OFFSET + 1] + r[MOVED + 1], p[2] + r[OFFSET + 2] + r[MOVED + 2])
     return Reference(p, v, a, j, s, yaw, yaw_rate, yaw_acceleration)
 
 
-def _turned(cos: float, sin: float, a: Vec3) -> Vec3:
-    return cos * a[0] - sin * a[1], sin * a[0] + cos * a[1], a[2]
-
-
 def _on_waves(r: Sequence[float], t_s: float) -> Reference:
-    x0, x1, x2, x3, x4 = _wave(r, SHAPE, t_s)
-    y0, y1, y2, y3, y4 = _wave(r, SHAPE + WAVE, t_s)
-    z0, z1, z2, z3, z4 = _wave(r, SHAPE + 2 * WAVE, t_s)
-    yaw_rate = r[HEADING + 1]
-    return Reference(
-        (x0, y0, z0),
-        (x1, y1, z1),
-        (x2, y2, z2),
-        (x3, y3, z3),
-        (x4, y4, z4),
-        r[HEADING] + yaw_rate * t_s,
-        yaw_rate,
-        0.0,
-    )
+    north, east, down = _wave(r, SHAPE, t_s), _wave(r, SHAPE + WAVE, t_s), _wave(r, SHAPE + 2 * WAVE, t_s)
+    return of_axes(north, east, down, _steady_heading(r, t_s))
 
 
-def _wave(r: Sequence[float], at: int, t_s: float) -> tuple[float, float, float, float, float]:
+def _steady_heading(r: Sequence[float], t_s: float) -> Vec3:
+    return r[HEADING] + r[HEADING + 1] * t_s, r[HEADING + 1], 0.0
+
+
+def _wave(r: Sequence[float], at: int, t_s: float) -> Derivatives:
     """Return an axis and its first four derivatives."""
     centre, slope, amplitude, w, phase = r[at], r[at + 1], r[at + 2], r[at + 3], r[at + 4]
     angle = w * t_s + phase
@@ -155,15 +143,13 @@ def _on_polynomials(r: Sequence[float], t_s: float) -> Reference:
     i = _piece(r, KNOTS, count, inside_s)
     at, begin_s = coefficients + 3 * TERMS * i, r[KNOTS + i]
     duration_s = r[KNOTS + i + 1] - begin_s
-    x0, x1, x2, x3, x4 = _polynomial(r, at, duration_s, inside_s - begin_s)
-    y0, y1, y2, y3, y4 = _polynomial(r, at + TERMS, duration_s, inside_s - begin_s)
-    z0, z1, z2, z3, z4 = _polynomial(r, at + 2 * TERMS, duration_s, inside_s - begin_s)
-    p, v, a, j, s = (x0, y0, z0), (x1, y1, z1), (x2, y2, z2), (x3, y3, z3), (x4, y4, z4)
-    if inside_s != t_s:  # straight on
+    north = _polynomial(r, at, duration_s, inside_s - begin_s)
+    east = _polynomial(r, at + TERMS, duration_s, inside_s - begin_s)
+    down = _polynomial(r, at + 2 * TERMS, duration_s, inside_s - begin_s)
+    if inside_s != t_s:
         past_s = t_s - inside_s
-        p = (x0 + past_s * x1, y0 + past_s * y1, z0 + past_s * z1)
-        a = j = s = (0.0, 0.0, 0.0)
-    yaw, yaw_rate, yaw_acceleration = r[HEADING] + r[HEADING + 1] * t_s, r[HEADING + 1], 0.0
+        north, east, down = _straight_on(north, past_s), _straight_on(east, past_s), _straight_on(down, past_s)
+    heading = _steady_heading(r, t_s)
     if yaw_count > 0:
         knots = coefficients + 3 * TERMS * count
         inside_s = min(max(t_s, r[knots]), r[knots + yaw_count])
@@ -171,9 +157,13 @@ def _on_polynomials(r: Sequence[float], t_s: float) -> Reference:
         begin_s = r[knots + i]
         at, duration_s = knots + yaw_count + 1 + TERMS * i, r[knots + i + 1] - begin_s
         yaw, yaw_rate, yaw_acceleration, _, _ = _polynomial(r, at, duration_s, inside_s - begin_s)
-        if inside_s != t_s:
-            yaw_rate = yaw_acceleration = 0.0
-    return Reference(p, v, a, j, s, yaw, yaw_rate, yaw_acceleration)
+        heading = (yaw, yaw_rate, yaw_acceleration) if inside_s == t_s else (yaw, 0.0, 0.0)
+    return of_axes(north, east, down, heading)
+
+
+def _straight_on(axis: Derivatives, past_s: float) -> Derivatives:
+    """Return an axis so long after the end of its polynomials [s]."""
+    return axis[0] + past_s * axis[1], axis[1], 0.0, 0.0, 0.0
 
 
 def _piece(r: Sequence[float], knots: int, count: int, t_s: float) -> int:

@@ -17,7 +17,7 @@ from companion.control.types import Reference
 from companion.errors import RefusedError
 from companion.trajectory.flatness import BOUNDS, PointMass, Quantities, ReferenceLimits, quantities, uses
 from companion.trajectory.pieces import golden_maximum
-from companion.trajectory.polynomial import Coefficients, Derivatives, evaluate, through, travel_to_rest
+from companion.trajectory.polynomial import Coefficients, Derivatives, evaluate, of_axes, through, travel_to_rest
 from companion.trajectory.shapes import ZERO, Joint
 
 DURATION_MIN_S = 0.5
@@ -86,20 +86,9 @@ class Join:
         """
         d = self.duration_s
         t = min(max(t_s, 0.0), d)
-        x0, x1, x2, x3, x4 = evaluate(self.north, d, t)
-        y0, y1, y2, y3, y4 = evaluate(self.east, d, t)
-        z0, z1, z2, z3, z4 = evaluate(self.down, d, t)
         yaw, yaw_rate, yaw_acceleration, _, _ = evaluate(self.yaw, d, t)
-        return Reference(
-            (x0, y0, z0),
-            (x1, y1, z1),
-            (x2, y2, z2),
-            (x3, y3, z3),
-            (x4, y4, z4),
-            yaw,
-            yaw_rate,
-            yaw_acceleration,
-        )
+        axes = evaluate(self.north, d, t), evaluate(self.east, d, t), evaluate(self.down, d, t)
+        return of_axes(*axes, (yaw, yaw_rate, yaw_acceleration))
 
     def joints(self) -> tuple[Joint, ...]:
         """One polynomial has no joints."""

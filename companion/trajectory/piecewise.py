@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from companion.control.types import Reference
 from companion.trajectory.pieces import Samples
-from companion.trajectory.polynomial import Coefficients, Derivatives, evaluate
+from companion.trajectory.polynomial import Coefficients, Derivatives, evaluate, of_axes
 from companion.trajectory.shapes import ZERO, Joint, Shape
 
 TERMS = 10
@@ -98,19 +98,11 @@ class Piecewise(Shape):
         start_s = self.knots_s[index]
         duration_s = self.knots_s[index + 1] - start_s
         north, east, down = self.pieces[index]
-        x0, x1, x2, x3, x4 = evaluate(north, duration_s, t_s - start_s)
-        y0, y1, y2, y3, y4 = evaluate(east, duration_s, t_s - start_s)
-        z0, z1, z2, z3, z4 = evaluate(down, duration_s, t_s - start_s)
-        yaw, yaw_rate, yaw_acceleration = self._yaw(t_s)
-        return Reference(
-            (x0, y0, z0),
-            (x1, y1, z1),
-            (x2, y2, z2),
-            (x3, y3, z3),
-            (x4, y4, z4),
-            yaw,
-            yaw_rate,
-            yaw_acceleration,
+        return of_axes(
+            evaluate(north, duration_s, t_s - start_s),
+            evaluate(east, duration_s, t_s - start_s),
+            evaluate(down, duration_s, t_s - start_s),
+            self._yaw(t_s),
         )
 
     def _yaw(self, t_s: float) -> tuple[float, float, float]:

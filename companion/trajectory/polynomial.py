@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from companion.control.types import Reference
+
 Derivatives = tuple[float, float, float, float, float]
 """A value and its first four derivatives over time (SI)."""
 
@@ -60,6 +62,14 @@ def evaluate(c: Coefficients, duration_s: float, t_s: float) -> Derivatives:
     )
     y4 = 24.0 * c4 + x * (120.0 * c5 + x * (360.0 * c6 + x * (840.0 * c7 + x * (1680.0 * c8 + x * 3024.0 * c9))))
     return y0, y1 * n, y2 * n2, y3 * n2 * n, y4 * n2 * n2
+
+
+def of_axes(north: Derivatives, east: Derivatives, down: Derivatives, heading: tuple[float, float, float]) -> Reference:
+    """Return the reference of three axes and of a heading [rad] with its rate and its acceleration; a kernel."""
+    x0, x1, x2, x3, x4 = north
+    y0, y1, y2, y3, y4 = east
+    z0, z1, z2, z3, z4 = down
+    return Reference((x0, y0, z0), (x1, y1, z1), (x2, y2, z2), (x3, y3, z3), (x4, y4, z4), *heading)
 
 
 def travel_to_rest(start: Derivatives, duration_s: float) -> float:
