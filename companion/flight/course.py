@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from enum import Enum
 from typing import NamedTuple
@@ -71,6 +71,14 @@ def _clear(plan: Plan, limits: ReferenceLimits, easy: ReferenceLimits, clear: Ca
     return gentle_one
 
 
+def _curves(pieces: Iterable[tuple[Anchored | Join, float]]) -> Iterator[Curve]:
+    """The curves of pieces, given with their begin on the course [s]."""
+    for piece, begin_s in pieces:
+        numbers = curve_of(piece)
+        if numbers is not None:
+            yield Curve(begin_s, begin_s + piece.duration_s, np.array(numbers))
+
+
 class Part(Enum):
     """A part of a course: what to call it, and what to do where it is in the way of something, for people."""
 
@@ -85,6 +93,16 @@ class Obstruction(NamedTuple):
     part: Part
     sentence: str
     """For people."""
+
+
+class Curve(NamedTuple):
+    """A piece of a course as numbers."""
+
+    begin_s: float
+    """Time on the course at which it begins [s]."""
+    end_s: float
+    numbers: NDArray[np.float64]
+    """See `trajectory.curve`."""
 
 
 def at_rest(p: Vec3, yaw_rad: float) -> Reference:
@@ -126,7 +144,7 @@ class Course:
         self._clearance: Clearance | None = None
         if height_min_m is not None:
             self._clearance = Clearance(path, vehicle.limits, hold_point, home, self.origin, height_min_m)
-        pieces: list[Piece] = []
+        pieces: list[Join] = []
         self.join_s = 0.0
         if trajectory.join == "smooth":
             begin = path.at(0.0)
@@ -145,9 +163,8 @@ class Course:
         self.track_s = path.duration_s
         self.stop_s = stopping.duration_s
         self._chain = chain([*pieces, path, stopping])
-        numbers = curve_of(path)
-        self.curve = None if numbers is None else np.array(numbers)
-        """The trajectory as numbers (`trajectory.curve`); None: it has none."""
+        self.curves = tuple(_curves(zip((*pieces, path, stopping), self._chain.starts_s, strict=True)))
+        """Its pieces as numbers, those that have any."""
         self._tempo = Tempo()
         self.moved_m: Vec3 = ZERO
         """By how much it was moved since it was planned, NED: its hold point, path, home and origin do not show it."""
@@ -196,8 +213,8 @@ class Course:
         """Moves all of it (NED): after the autopilot's estimate has jumped by as much."""
         (x, y, z), (dx, dy, dz) = self.moved_m, by_m
         self.moved_m = (x + dx, y + dy, z + dz)
-        if self.curve is not None:
-            self.curve[MOVED : MOVED + 3] = self.moved_m
+        for curve in self.curves:
+            curve.numbers[MOVED : MOVED + 3] = self.moved_m
 
     @property
     def changes_s(self) -> float:
@@ -257,21 +274,29 @@ class Timed:
     """
 
     def __init__(self, course: Course, begin_s: float) -> None:
-        self.course, self.begin_s, self.join_s = course, begin_s, course.join_s
+        self.course, self.begin_s = course, begin_s
+        self._curve = course.curves[0] if course.curves else None
 
     def __call__(self, t_s: float) -> Reference:
         """The reference at a vehicle time [s]."""
         return self.course.at(t_s - self.begin_s)
 
-    def curve(self, stamp_s: float, delay_s: float) -> NDArray[np.float64] | None:
+    def curve(self, stamp_s: float, delay_s: float) -> Curve | None:
         """The curve that gives the reference at a stamp and a delay later [s], where one does; else None.
 
         It goes by the times alone: a replay, which knows all changes of the pace from its beginning, takes the same.
         """
-        course, effect_s = self.course, stamp_s + delay_s - self.begin_s
-        if course.curve is None or stamp_s - self.begin_s - self.join_s < 0.0 or effect_s >= course.changes_s:
+        course, curve, now_s = self.course, self._curve, stamp_s - self.begin_s
+        effect_s = now_s + delay_s
+        if curve is None or effect_s >= course.changes_s:
             return None
-        return course.curve if effect_s - self.join_s <= course.track_s else None
+        if curve.begin_s <= now_s and effect_s < curve.end_s:  # as the last time
+            return curve
+        for other in course.curves:
+            if other.begin_s <= now_s and effect_s < other.end_s:
+                self._curve = other
+                return other
+        return None
 
 
 class _OwnPace:

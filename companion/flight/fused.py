@@ -26,7 +26,7 @@ ON_CURVE = 1
 BEGIN = 2
 """Vehicle time at which the course began [s]."""
 JOIN = 3
-"""How long after that its trajectory does [s]."""
+"""How long after that the piece does that the curve is of [s]."""
 WHOLE = 4
 """1: with the history; 0: pieces and thrust are given, and nothing is remembered."""
 INPUT = 5

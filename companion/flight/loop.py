@@ -19,7 +19,7 @@ from dataclasses import replace
 from companion.config import Flight
 from companion.control.history import Attitude
 from companion.control.output import PositionSetpoint, Setpoint
-from companion.control.types import State
+from companion.control.types import State, new_record
 from companion.errors import LinkError
 from companion.flight.accounting import Accounting, FlownStep, Progress
 from companion.flight.adaptation import Adaptation, adapted
@@ -34,11 +34,12 @@ from companion.flight.last_resort import ask_for_hold
 from companion.flight.measure import silence_limit_s
 from companion.flight.phases import Autopilot, Cause, Engagement, FlightEnded, Order, Outcome, Phase
 from companion.flight.preflight import Preflight
+from companion.flight.reflex import ANSWERED, DECLINED, Reflex
 from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report, vehicle_facts
 from companion.flight.responses import respond
 from companion.flight.retuning import ParameterChange, Retuning
 from companion.flight.sequence import Duty, Sequence
-from companion.flight.tracker import Kernels, Tracker
+from companion.flight.tracker import Kernels, Tracker, TrackerStep
 from companion.flight.watch import Watch
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
@@ -68,7 +69,7 @@ GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, RC_CHANNELS, VFR_HUD, POSITION_TARGET_LOC
 lockstep they cost a third of the time."""
 ATTITUDE_INTERVAL_US = 3_200
 """Of ATTITUDE_QUATERNION, which refreshes the rotation that is predicted: PX4 has one at each of its 4 ms."""
-ANSWERED = frozenset((codec.ODOMETRY, codec.ATTITUDE_QUATERNION))
+FLOWN_ON = frozenset((codec.ODOMETRY, codec.ATTITUDE_QUATERNION))
 """What a setpoint is computed from: what comes behind the newest of them is read when that is answered. So a change of
 the mode that came together with a state, and behind it, is known one setpoint later."""
 LOCKSTEP_SPIN_S = 0.0005
@@ -161,6 +162,10 @@ class FlightLoop:
         """Stamp of the last state that a setpoint went out for."""
         self._coasted = False
         self._timed: Timed | None = None
+        self._reflex: Reflex | None = None
+        """Answers ordinary states; None where the step is not compiled."""
+        self._reflexed = False
+        """Whether this turn has answered a state by reflex."""
         self._unaccounted: FlownStep | None = None
         self._engagement: Engagement | None = None
         self._delays_told = 0
@@ -271,6 +276,7 @@ class FlightLoop:
 
     def _leave(self, detail: str) -> str:
         """However it ended: a vehicle that may still be following setpoints gets the coast setpoint and Hold."""
+        self._wire.at_once = None
         with contextlib.suppress(Exception):  # the last step's row
             self._account()
         if not self._met or not self._sequence.owes_hold:
@@ -307,6 +313,9 @@ class FlightLoop:
             adapt=self._adapt,
         )
         self._met = True
+        if self._compiled.engine == "numba":
+            self._reflex = Reflex(system, (self._wire.system_id, self._wire.component_id))
+            self._wire.at_once = self._answer_at_once
 
     def _adapt(self, adaptation: Adaptation) -> None:
         """The loop as it was measured asks for other setpoints or gains: all that flies is made anew, on the ground or
@@ -355,12 +364,16 @@ class FlightLoop:
     def _turn(self) -> None:
         self._turned_ns = time.monotonic_ns()
         spin_s = LOCKSTEP_SPIN_S if self._peer.paced else 0.0
-        hurries_for = frozenset[int]() if self._peer.paced else ANSWERED
+        hurries_for = frozenset[int]() if self._peer.paced else FLOWN_ON
         for frame in self._wire.receive(self._wait_s(), spin_s, until=hurries_for):
             self._on_frame(frame)
         if not self._peer.paced:
             self._answer_state()
             self._tick()
+        elif self._reflexed:
+            self._account()
+            self._tick()
+        self._reflexed = False
         if self._requests:
             self._answer_requests()
         self._account()
@@ -545,10 +558,12 @@ class FlightLoop:
     def _silent_too_long(self, state: VehicleState) -> bool:
         """After more than half of COM_OF_LOSS_T PX4 may be about to leave OFFBOARD, and would come back at the next
         setpoint."""
-        if self._sent_us is None:
-            return False
-        loss_s = self._autopilot.parameters.get("COM_OF_LOSS_T", OFFBOARD_LOSS_S)
-        return state.t_vehicle_us - self._sent_us > 0.5e6 * loss_s
+        return self._sent_us is not None and state.t_vehicle_us - self._sent_us > self._own_silence_us()
+
+    def _own_silence_us(self) -> int:
+        """Half of COM_OF_LOSS_T."""
+        half_us = 0.5e6 * self._autopilot.parameters.get("COM_OF_LOSS_T", OFFBOARD_LOSS_S)
+        return int(half_us) if 0.0 <= half_us < 1e12 else int(0.5e6 * OFFBOARD_LOSS_S)
 
     def _stream(self, state: VehicleState) -> None:
         """A hold setpoint for where the vehicle is; nothing integrates while the autopilot does not follow."""
@@ -602,10 +617,74 @@ class FlightLoop:
             self._lost += 1
             return
         self._sent_ns = time.monotonic_ns()
-        track_s = sequence.track_time_s(stamp_s)
-        self._unaccounted = FlownStep(
-            state, out, course, stamp_s - begin_s, sequence.phase, track_s, skipped, arrival_ns
-        )
+        self._flown(state, out, skipped, arrival_ns)
+
+    def _answer_at_once(self, datagram: bytes, wall_ns: int) -> bool:
+        """Answers a datagram with an ordinary state by reflex; False: it is to take the usual way."""
+        sequence, telemetry, tracker, timed = self._sequence, self._telemetry, self._tracker, self._timed
+        last, last_us, sent_us, before = self._last_state, telemetry.last_t_vehicle_us, self._sent_us, telemetry.numbers
+        if sequence.duty is not Duty.TRACK or timed is None or last is None or last_us is None or sent_us is None:
+            return False
+        usual = telemetry.sound and self._pending is None and not (self._requests or sequence.preflight.meter.running)
+        if not usual or before is None or not isinstance(tracker, Tracker):
+            return False
+        if timed.course is not sequence.course or timed.begin_s != sequence.engaged_at_s or not self._peer.settled:
+            return False
+        reflex, system, paced = self._reflex, self._ops.target_system, self._peer.paced
+        assert reflex is not None
+        asked_us = self._peer.asked_us if paced else -1
+        if asked_us is None:
+            return False
+        given = (*self._wire.due(system, AUTOPILOT_COMPONENT), time.monotonic_ns(), last_us, sent_us, asked_us)
+        if not reflex.take(datagram, (*given, last.reset_counter, self._own_silence_us()), before):
+            return False
+        code = tracker.answer(reflex, timed)
+        if code == DECLINED:
+            return False
+        frames = reflex.output if code == ANSWERED else None
+        sender = system, AUTOPILOT_COMPONENT
+        sent = self._wire.answer(datagram, wall_ns, sender, 2 if paced else 1, frames)
+        self._sent_ns = time.monotonic_ns()
+        self._reflexed = True
+        state, out = self._take_over(reflex, tracker, wall_ns)
+        if sent:
+            self._sent_us = state.t_vehicle_us
+            self._sender.sent += 1
+            self._flown(state, out, 0, wall_ns)
+            return True
+        self._lost += 1
+        if frames is None:
+            self._send(out.setpoint, state)  # which says what is wrong with it, and ends the flight
+            if paced:
+                request = Timesync(0, reflex.asked_ns, 0, 0)
+                self._wire.send(codec.TIMESYNC, timesync.answer(request, time.monotonic_ns(), *sender))
+        return True
+
+    def _take_over(self, reflex: Reflex, tracker: Tracker, wall_ns: int) -> tuple[VehicleState, TrackerStep]:
+        """What was answered by reflex becomes known, in the order of the usual way."""
+        sequence, peer, clock = self._sequence, self._peer, self._clock
+        state, numbers = reflex.told()
+        self._heard_ns = wall_ns
+        self._telemetry.took(state.t_vehicle_us, numbers)
+        paced = peer.paced
+        peer.on_state(state.t_vehicle_us)
+        clock.on_state(state.t_vehicle_us, wall_ns)
+        if paced:
+            self._asked_ns = asked_ns = reflex.asked_ns
+            peer.on_request(asked_ns)
+            clock.on_timesync(asked_ns, wall_ns)
+        now_s = clock.now_s(wall_ns)
+        self._last_state, self._last_state_s, self._last_arrival_ns = state, now_s, wall_ns
+        sequence.on_state(state, now_s)
+        return state, tracker.answered(state.t_vehicle_us * 1e-6, new_record(State, state[1:5]))
+
+    def _flown(self, state: VehicleState, out: TrackerStep, skipped: int, arrival_ns: int) -> None:
+        """A setpoint is out; what it came from is accounted for later."""
+        sequence = self._sequence
+        assert sequence.course is not None
+        course, stamp_s = sequence.course, state.t_vehicle_us * 1e-6
+        step = (state, out, course, stamp_s - sequence.engaged_at_s, sequence.phase, sequence.track_time_s(stamp_s))
+        self._unaccounted = new_record(FlownStep, (*step, skipped, arrival_ns))
 
     def _reference(self, course: Course, begin_s: float) -> Timed:
         """The course on the vehicle's clock; the same as long as neither changes."""

@@ -30,7 +30,7 @@ from companion.flight.tracker import Kernels, kernels
 from companion.link.framing import refused_since
 from companion.link.transport import parse_connection
 from companion.link.vehicle_link import VehicleLink
-from companion.link.wire import Wire
+from companion.link.wire import COMPANION_COMPONENT, Wire
 from companion.realtime import prepare, take_core_of_two, take_priority
 from companion.record.flight_record import RECORD_FILE, FlightRecord
 from companion.record.folder import CONFIGURATION_FILE, SUMMARY_FILE, write_summary
@@ -224,6 +224,7 @@ def warm_up(flight: Any, compiled: Any) -> None:
     """Compiles or loads what a control step needs, before anything connects: nothing is compiled in the air."""
     from companion.control.types import State
     from companion.flight.course import at_rest
+    from companion.flight.reflex import Reflex
 
     tracker = controller_of(flight, compiled)
     zero = (0.0, 0.0, 0.0)
@@ -231,6 +232,8 @@ def warm_up(flight: Any, compiled: Any) -> None:
     tracker.begin(state)
     for i in range(3):
         tracker.step(1.0 + i / flight.vehicle.link.state_rate_hz, state, lambda t: at_rest(zero, 0.0))
+    if compiled.engine == "numba":
+        Reflex(1, (1, COMPANION_COMPONENT))
 
 
 def _finish(

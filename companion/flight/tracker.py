@@ -35,12 +35,13 @@ from companion.control.output import (
     lead,
     rates_output,
 )
-from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
+from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3, new_record
 from companion.control.vectors import add, axes, norm
 from companion.control.vectors import scale as scale_vector
 from companion.flight import fused
 from companion.flight.course import Timed
 from companion.flight.prediction import Prediction
+from companion.flight.reflex import DECLINED, Reflex
 from companion.flight.resets import Reset, about_vertical
 from companion.flight.retuning import Transition, Turning, between
 from companion.flight.thrust_scale import ThrustScale
@@ -278,14 +279,42 @@ class CompiledEngine:
             self._pack(self._bytes, 0, stamp_s, 0.0, 0.0, 0.0, 1.0, *p, *v, *q, *w, dt_s, frozen, integrate)
             self._give(reference_at(stamp_s + delay_s))
         else:
-            begin_s, join_s = timed.begin_s, timed.join_s
-            self._pack(self._bytes, 0, stamp_s, 1.0, begin_s, join_s, 1.0, *p, *v, *q, *w, dt_s, frozen, integrate)
+            begin_s, piece_s = timed.begin_s, curve.begin_s
+            self._pack(self._bytes, 0, stamp_s, 1.0, begin_s, piece_s, 1.0, *p, *v, *q, *w, dt_s, frozen, integrate)
+        self.give_attitude(attitude)
+        self._kernel(self._m, prediction.numbers, self._no_curve if curve is None else curve.numbers)
+        return *self.results(), curve is not None
+
+    def refer(self, timed: Timed, stamp_s: float, delay_s: float) -> Any:
+        """Gives the next step its reference, for a state with this stamp [s]; returns the curve that it is on."""
+        m, curve = self._m, timed.curve(stamp_s, delay_s)
+        if curve is None:
+            m[fused.ON_CURVE] = 0.0
+            self._give(timed(stamp_s + delay_s))
+            return self._no_curve
+        m[fused.ON_CURVE], m[fused.BEGIN], m[fused.JOIN] = 1.0, timed.begin_s, curve.begin_s
+        return curve.numbers
+
+    @property
+    def numbers(self) -> Any:
+        """What `fused.flight_step` works on."""
+        return self._m
+
+    @property
+    def on_curve(self) -> bool:
+        """Whether the last step had its reference from a curve."""
+        return bool(self._m[fused.ON_CURVE] > 0.5)
+
+    def give_attitude(self, attitude: Attitude | None) -> None:
+        """One that is newer than the next state, if there is one."""
         if attitude is None:
             self._m[fused.ATTITUDE] = 0.0
         else:
             self._m[fused.ATTITUDE : fused.RESULTS] = attitude.at_s, *attitude.q, *attitude.w
-        self._kernel(self._m, prediction.numbers, self._no_curve if curve is None else curve)
-        return self._unpack(self._bytes, _RESULTS), self._unpack_rest(self._bytes, _REST), curve is not None
+
+    def results(self) -> tuple[Numbers, Numbers]:
+        """What the last step gave: the numbers of `step`, and those from `fused.SHARE` on."""
+        return self._unpack(self._bytes, _RESULTS), self._unpack_rest(self._bytes, _REST)
 
     def _give(self, reference: Reference) -> None:
         p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
@@ -454,6 +483,28 @@ class Tracker:
             self._scale.interrupt()
         return out
 
+    def answer(self, reflex: Reflex, timed: Timed) -> int:
+        """Lets a reflex make the next step from the datagram that it took, if all is as it was for the last one.
+
+        Returns:
+            what `reflex.reflex` does.
+        """
+        whole, last_s = self._whole, self._last_s
+        same = self._delay_wanted_s is None and self._transition is None and self._scale is None
+        if whole is None or last_s is None or not (same and self._by_rates):
+            return DECLINED
+        whole.give_attitude(self._attitude)
+        r = whole.refer(timed, reflex.stamp_us * 1e-6, self.delay_s)
+        return reflex.run(whole.numbers, self._prediction.numbers, r, last_s, self._gap_max_s)
+
+    def answered(self, stamp_s: float, state: State) -> TrackerStep:
+        """What the step did that `answer` has made for this state."""
+        assert self._whole is not None
+        self._last_s, self._seen = stamp_s, state
+        if self._attitude is not None and self._attitude.at_s <= stamp_s:
+            self._attitude = None
+        return self._whole_step(*self._whole.results(), on_curve=self._whole.on_curve)
+
     def _step(self, start: WholeStep, reference_at: ReferenceAt, attitude: Attitude | None) -> TrackerStep:
         """The step put together here."""
         stamp_s, state, delay_s, frozen, integrate, dt_s = start
@@ -473,12 +524,13 @@ class Tracker:
     ) -> TrackerStep:
         """The step as one call."""
         n, rest, on_curve = whole.fly(start, self._prediction, reference_at, attitude)
+        return self._whole_step(n, rest, on_curve=on_curve, dt_s=start.dt_s)
+
+    def _whole_step(self, n: Numbers, rest: Numbers, *, on_curve: bool, dt_s: float = 0.0) -> TrackerStep:
+        """What a step did that was one call."""
         share, used, px, py, pz, vx, vy, vz = rest
         self.refreshed += used > 0.5
-        if self._by_rates:
-            setpoint: Setpoint = RateSetpoint(share, _vec3(n[flat.RATES]))
-        else:
-            setpoint = self._convert(n, start.dt_s)
+        setpoint = new_record(RateSetpoint, (share, _vec3(n[flat.RATES]))) if self._by_rates else self._convert(n, dt_s)
         return TrackerStep(setpoint, n, Target((px, py, pz), (vx, vy, vz)) if on_curve else None)
 
     # -- the thrust's scale ---------------------------------------------------------------------------------------

@@ -143,6 +143,17 @@ class FrameParser:
         self._last_seq: dict[int, int] = {}
         """By sender: its system id << 8 | its component id."""
 
+    def due(self, sysid: int, compid: int) -> int:
+        """The sequence number that a sender's next frame has if none is lost; -1 before the first."""
+        last = self._last_seq.get(sysid << 8 | compid)
+        return -1 if last is None else (last + 1) & 0xFF
+
+    def took(self, sysid: int, compid: int, count: int) -> None:
+        """So many frames of a sender, the ones that were due, were checked and used elsewhere."""
+        self._counters.received += count
+        self._last_seq[sysid << 8 | compid] += count
+        self._last_seq[sysid << 8 | compid] &= 0xFF
+
     def parse(self, data: bytes, wall_ns: int, frames: list[Frame], unknown: list[bytes], final: bool = True) -> int:
         """Append the frames in `data` to `frames`; return how many bytes are done with.
 

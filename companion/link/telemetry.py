@@ -100,8 +100,8 @@ class Telemetry:
         self.rejected: dict[StateRejection, int] = dict.fromkeys(StateRejection, 0)
         """Messages not taken, by reason."""
         self._last_us: int | None = None
-        self._numbers: tuple[Vec3, Vec3, Quat, Vec3] | None = None
-        """Of the last message whose stamp was sound."""
+        self.numbers: tuple[Vec3, Vec3, Quat, Vec3] | None = None
+        """Of the last ODOMETRY whose stamp was sound, as they came."""
         self._ahead_us: int | None = None
         self._back_us: int | None = None
         self._back_count = 0
@@ -123,6 +123,22 @@ class Telemetry:
             self.accepted += 1
         return state
 
+    def took(self, t_us: int, numbers: tuple[Vec3, Vec3, Quat, Vec3]) -> None:
+        """A state was judged elsewhere by the same rules, and taken.
+
+        Args:
+            t_us: its stamp [us].
+            numbers: of its message, as they came.
+        """
+        self._last_us, self.numbers = t_us, numbers
+        self._back_us, self._back_count, self._ahead_us = None, 0, None
+        self.accepted += 1
+
+    @property
+    def sound(self) -> bool:
+        """Whether states have come, and no reboot is known."""
+        return self._last_us is not None and not self._rebooted
+
     def _read_odometry(self, frame: Frame) -> VehicleState | StateRejection:
         """The state in the message, or what is wrong with it."""
         if frame.sysid != self.system_id or frame.compid != self.component_id:
@@ -133,8 +149,8 @@ class Telemetry:
         late = self._judge_stamp(t_us)
         if late is not None:
             return late
-        numbers, before = (p, v, attitude, w), self._numbers
-        self._numbers = numbers
+        numbers, before = (p, v, attitude, w), self.numbers
+        self.numbers = numbers
         if numbers == before and max(map(abs, (*v, *w))) > FROZEN_ABOVE:
             return StateRejection.FROZEN
         if quality < 0:
@@ -213,7 +229,7 @@ class Telemetry:
     def restart(self) -> None:
         """Forget the past (not the counts): after a recognised reboot, before a new flight."""
         self._last_us = self._ahead_us = self._back_us = None
-        self._numbers = None
+        self.numbers = None
         self._back_count = 0
         self._rebooted = False
         self._attitude_us = -1

@@ -80,6 +80,16 @@ class PacedPeer:
         self.paced = False
         """Whether the vehicle waits for our answers."""
 
+    @property
+    def asked_us(self) -> int | None:
+        """The vehicle's time when it asked last [us]."""
+        return self._asked_us
+
+    @property
+    def settled(self) -> bool:
+        """Whether the next state changes nothing about it, if it comes in time."""
+        return self.paced or self._streak < self._needed
+
     def on_state(self, t_vehicle_us: int) -> None:
         """A new state came, with its own stamp."""
         if self._asked_us is not None and t_vehicle_us - self._asked_us > PACED_INTERVAL_MAX_US:

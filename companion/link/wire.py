@@ -73,6 +73,9 @@ class Wire:
         """Whom we talk to; None until a valid frame came (and always on a serial line)."""
         self.last_foreign: Address | None = None
         """Who else sent to our port, if anybody, for the explanation of a silent vehicle."""
+        self.at_once: Callable[[bytes, int], bool] | None = None
+        """Asked about a datagram of the peer that comes alone, with its arrival, before it is parsed: whether it was
+        used. For who answers the usual one without any detour. Never on a serial line, nor where frames are signed."""
         self._transport = transport
         self._tap = tap
         self._untold: list[tuple[int, bytes, int]] = []
@@ -213,6 +216,10 @@ class Wire:
                 if address == self.peer and data[:1] == _V2 and int.from_bytes(data[_MSGID], "little") in until:
                     end = i + 1
                     break
+        if end == 1:
+            data, address, wall_ns = unread.pop(0)
+            self._use_datagram(data, address, wall_ns, frames, unknown)
+            return
         for data, address, wall_ns in unread[:end]:
             self._parse_datagram(data, address, wall_ns, frames, unknown)
         del unread[:end]
@@ -234,7 +241,7 @@ class Wire:
         if self._line is not None:
             self._parse_stream(self._line, got[0], wall_ns, frames, unknown)
         else:
-            self._parse_datagram(got[0], got[1], wall_ns, frames, unknown)
+            self._use_datagram(got[0], got[1], wall_ns, frames, unknown)
         return True
 
     def _spin(self, spin_s: float, frames: list[Frame], unknown: list[bytes]) -> bool:
@@ -247,6 +254,15 @@ class Wire:
             if read(frames, unknown):
                 return True
         return False
+
+    def _use_datagram(
+        self, data: bytes, address: Address | None, wall_ns: int, frames: list[Frame], unknown: list[bytes]
+    ) -> None:
+        """Use a datagram before which nothing waits to be used."""
+        if self.at_once is not None and address == self.peer and self._guard is None and self.at_once(data, wall_ns):
+            self._heard_ns = wall_ns
+        else:
+            self._parse_datagram(data, address, wall_ns, frames, unknown)
 
     def _parse_datagram(
         self, data: bytes, address: Address | None, wall_ns: int, frames: list[Frame], unknown: list[bytes]
@@ -366,6 +382,40 @@ class Wire:
                 self.tell()
         return True
 
+    def due(self, sysid: int, compid: int) -> tuple[int, int]:
+        """The sequence numbers that are due: of a sender's next frame if none is lost (-1 before its first), and of our
+        own."""
+        return self._parser.due(sysid, compid), self._seq
+
+    def answer(
+        self, datagram: bytes, wall_ns: int, sender: tuple[int, int], count: int, frames: memoryview | None
+    ) -> bool:
+        """Send what answers a datagram that `at_once` was asked about.
+
+        Args:
+            datagram: that is answered; its frames were checked, are all of the sender, and were due.
+            wall_ns: when it arrived.
+            sender: its system and component id.
+            count: how many frames are in it, and in the answer.
+            frames: the answer, with our own next sequence numbers; None: there is none.
+
+        Returns:
+            False, and counted, when it did not go out.
+        """
+        raw = None if frames is None else frames.tobytes()
+        out = raw is not None and self._write(raw)
+        self._parser.took(*sender, count)
+        if self._tap is not None:
+            self._untold.append((TAP_IN, datagram, wall_ns))
+        if raw is None or not out:
+            self.counters.send_dropped += raw is not None
+            return False
+        self._seq = (self._seq + count) & 0xFF
+        self.counters.sent += count
+        if self._tap is not None:
+            self._untold.append((TAP_OUT, raw, time.monotonic_ns()))
+        return True
+
     def gather(self) -> None:
         """Keep what is sent from now on, for `release`: for a vehicle in lockstep, which waits for the last of it."""
         self._gathered = []
@@ -421,6 +471,7 @@ class Wire:
 
     def close(self) -> None:
         """Close the link; what was read and not used yet is in the log, too."""
+        self.at_once = None
         if self._unread:
             frames: list[Frame] = []
             unknown: list[bytes] = []

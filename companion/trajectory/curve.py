@@ -1,8 +1,8 @@
-"""A trajectory in its place as a row of numbers, for control steps that are compiled: what sines or polynomials give.
+"""A piece of a course as a row of numbers, for control steps that are compiled: what sines or polynomials give.
 
-`curve_of` makes the numbers on the ground, `on_curve` evaluates them: the reference of `Anchored.at` within the
-trajectory's own time, to rounding. `on_curve` is a kernel (see `companion.accelerate`). Shapes that are neither sines
-nor polynomials have no such row; whoever flies them asks the trajectory itself.
+`curve_of` makes the numbers on the ground, `on_curve` evaluates them: the reference of `Anchored.at` or `Join.at`
+within the piece's own time, to rounding. `on_curve` is a kernel (see `companion.accelerate`). Shapes that are neither
+sines nor polynomials have no such row; whoever flies them asks the trajectory itself.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from companion.control.types import Reference, Vec3
 from companion.trajectory.anchored import Anchored, rotated
+from companion.trajectory.joins import Join
 from companion.trajectory.piecewise import TERMS, Piecewise
 from companion.trajectory.polynomial import Derivatives, evaluate, of_axes
 from companion.trajectory.shapes import ZERO, Circle, Helix, Hover, Lemniscate, Lissajous, Shape
@@ -44,8 +45,12 @@ KNOTS = SHAPE + 2
 Wave = tuple[float, float, float, float, float, float]
 
 
-def curve_of(path: Anchored) -> list[float] | None:
-    """Return the row of a trajectory in its place; None for a shape that has none."""
+def curve_of(path: Anchored | Join) -> list[float] | None:
+    """Return the row of a trajectory in its place, or of a join or stop; None for a shape that has none."""
+    if isinstance(path, Join):
+        knots = (0.0, path.duration_s)
+        axes = (*path.north, *path.east, *path.down)
+        return [POLYNOMIALS, 1.0, 1.0, *(0.0,) * (SHAPE - COS - 1), 1.0, 1.0, *knots, *axes, *knots, *path.yaw]
     trajectory = path.trajectory
     shape = trajectory.shape
     numbers = _polynomials(shape) if isinstance(shape, Piecewise) else _waves(shape)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from companion.flight.bundled import free_udp_port
 from companion.flight.health import SystemHealth
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause
-from companion.flight.tracker import kernels
+from companion.flight.reflex import ANSWERED, UNSENDABLE
+from companion.flight.tracker import Tracker, kernels
 from companion.link.wire import Wire
 from companion.record.columns import COLUMNS
 from companion.record.flight_record import FlightRecord
@@ -155,6 +157,56 @@ def test_same_seed_same_flight(engine: str, tmp_path) -> None:
     kept = [name for name in COLUMNS if name not in WALL_COLUMNS]
     assert first.record.columns(*kept).tobytes() == second.record.columns(*kept).tobytes()
     assert all(without_wall_clock(first.summary) != without_wall_clock(other.summary) for other in others)
+
+
+@pytest.mark.numba
+def test_a_flight_does_not_show_which_states_were_answered_by_reflex(tmp_path, monkeypatch) -> None:
+    """States that are answered in one call, and the same flight with all of them taking the usual way."""
+    flight = make_flight(trajectory=dict(INDOOR) | {"duration_s": 2.0}, world__force_n=[2.0, 0.0, 0.0])
+    answer, answered = FlightLoop._answer_at_once, []
+
+    def counted(loop: FlightLoop, datagram: bytes, wall_ns: int) -> bool:
+        answered.append(answer(loop, datagram, wall_ns))
+        return answered[-1]
+
+    def never(loop: FlightLoop, datagram: bytes, wall_ns: int) -> bool:
+        return False
+
+    flights, setpoints = [], []
+    for way in (counted, never):
+        monkeypatch.setattr(FlightLoop, "_answer_at_once", way)
+        with Stand(flight, tmp_path) as stand:
+            flights.append(stand.fly(engine="numba"))
+            setpoints.append([(heard.t_us, heard.message.to_dict()) for heard in stand.setpoints()])
+    by_reflex, usual = flights
+    assert sum(answered) > 0.6 * len(by_reflex.record) > 200
+    assert by_reflex.cause is usual.cause is Cause.COMPLETED
+    assert without_wall_clock(by_reflex.summary) == without_wall_clock(usual.summary)
+    kept = [name for name in COLUMNS if name not in WALL_COLUMNS]
+    assert by_reflex.record.columns(*kept).tobytes() == usual.record.columns(*kept).tobytes()
+    assert setpoints[0] == setpoints[1]
+
+
+@pytest.mark.numba
+def test_a_setpoint_by_reflex_that_cannot_be_sent_ends_the_flight(tmp_path, monkeypatch) -> None:
+    answer, answered, left = Tracker.answer, Tracker.answered, [100]
+
+    def count_down(tracker: Tracker, *given: Any) -> int:
+        left[0] -= 1
+        code = answer(tracker, *given)
+        return UNSENDABLE if code == ANSWERED and left[0] <= 0 else code
+
+    def spoilt(tracker: Tracker, *given: Any) -> Any:
+        out = answered(tracker, *given)
+        return out._replace(setpoint=out.setpoint._replace(thrust=math.nan)) if left[0] <= 0 else out
+
+    monkeypatch.setattr(Tracker, "answer", count_down)
+    monkeypatch.setattr(Tracker, "answered", spoilt)
+    with Stand(make_flight(trajectory=dict(INDOOR)), tmp_path) as stand:
+        flown = stand.fly(engine="numba")
+        assert stand.mode is Mode.HOLD
+    assert flown.cause is Cause.UNSENDABLE
+    assert "thrust nan" in flown.outcome.sentence
 
 
 # ---- nobody there, or somebody else --------------------------------------------------------------------------------

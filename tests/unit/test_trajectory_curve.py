@@ -78,25 +78,34 @@ def test_a_shape_of_another_kind_has_no_numbers() -> None:
     assert curve_of(anchored(Trajectory(name="line", shape=line, duration_s=4.0), (0.0, 0.0, -5.0), None)) is None
 
 
-def test_a_course_has_a_curve_within_its_trajectory_at_its_own_pace_only() -> None:
+def test_a_course_has_a_curve_within_each_of_its_pieces_at_its_own_pace_only() -> None:
     vehicle = load_vehicle("bundled")
     trajectory = Trajectory(name="circle", shape=SHAPES["circle"], duration_s=10.0)
     course = Course(trajectory, vehicle, (0.0, 0.0, -10.0), 0.0, None)
     timed = Timed(course, 100.0)
     begin_s, end_s = 100.0 + course.join_s, 100.0 + course.join_s + 10.0
     assert course.join_s > 1.0
+    stopped_s = end_s + course.stop_s
     for stamp_s, known in (
+        (99.9, False),
+        (100.0, True),
+        (begin_s - 0.05, True),
         (begin_s - 0.01, False),
         (begin_s + 0.01, True),
         (end_s - 0.05, True),
         (end_s - 0.03, False),
-        (end_s + 1.0, False),
+        (end_s + 0.01, True),
+        (stopped_s - 0.03, False),
+        (stopped_s + 1.0, False),
     ):
         assert (timed.curve(stamp_s, 0.04) is not None) == known
     course.shift((1.0, 0.0, 0.0))
-    curve = timed.curve(begin_s + 2.0, 0.04)
-    assert curve is not None
-    assert on_curve(curve, 2.0).p == pytest.approx(timed(begin_s + 2.0).p, abs=1e-12)
+    for stamp_s in (100.0, 101.0, begin_s + 2.0, end_s + 0.5):
+        curve = timed.curve(stamp_s, 0.04)
+        assert curve is not None
+        assert numbers(on_curve(curve.numbers, stamp_s - 100.0 - curve.begin_s)) == pytest.approx(
+            numbers(timed(stamp_s)), abs=1e-12
+        )
     plan = course.plan_pace(begin_s - 100.0 + 3.0, 0.0)
     ramp = plan.work(plan.samples_max)
     assert ramp is not None
