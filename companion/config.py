@@ -71,11 +71,13 @@ class Autopilot(Section):
 
 
 class Link(Section):
-    """[link]: rate and age of the state, delay of the commands."""
+    """[link]: rate and age of the state, delay of the commands, and who listens."""
 
     state_rate_hz: Annotated[float, Field(ge=10.0, le=1000.0)]
     state_age_s: Annotated[float, Field(ge=0.0, le=0.5)]
     command_delay_s: Annotated[float, Field(ge=0.0, le=0.5)]
+    exclusive: bool = False
+    """Nobody else listens on it: in flight the autopilot need not send what this program does not use."""
 
 
 class Noise(Section):

@@ -144,6 +144,8 @@ _KEYS = (
     _Key("noise", "rate_walk_rad_s_per_sqrt_s", "walk_rate_rad_s", 0, "0 or more", _not_negative, 0.0),
     _Key("noise", "walk_time_constant_s", "walk_time_constant_s", 0, "0 or more", _not_negative, 0.0),
 )
+_COMPANIONS = {"link": ("exclusive",)}
+"""Keys of these sections that only the companion reads."""
 _SECTIONS = tuple(dict.fromkeys(k.section for k in _KEYS))
 
 
@@ -194,7 +196,7 @@ def parse(document: Mapping[str, Any], path: str) -> VehicleFile:
 
 def _check_section(document: Mapping[str, Any], section: str, path: str) -> None:
     """Raise VehicleFileError unless a section is there, a table, and holds exactly its keys."""
-    keys = [k.key for k in _KEYS if k.section == section]
+    keys = [*(k.key for k in _KEYS if k.section == section), *_COMPANIONS.get(section, ())]
     required = [k.key for k in _KEYS if k.section == section and k.default is None]
     must = ", ".join(required)
     if section not in document:

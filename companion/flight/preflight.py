@@ -210,6 +210,8 @@ class Preflight:
         calibrates = flight.calibration is not None
         self.meter = LinkMeter(silence_limit_s(flight.vehicle.link.state_rate_hz, calibrates=calibrates))
         """Measures the link; the loop tells it what comes."""
+        self.streams: dict[int, int] = {}
+        """Intervals of further messages that are asked for at the beginning [us] (`Operations.set_message_interval`)."""
         self.findings: list[Finding] = []
         """Of all gates, once they have judged."""
         self._begun_s: float | None = None
@@ -252,6 +254,8 @@ class Preflight:
         self._rate = ops.set_message_interval(codec.ODOMETRY, int(1e6 / rate * ASK_FASTER), now_s)
         for msgid, hz in MESSAGE_RATES_HZ.items():
             ops.set_message_interval(msgid, int(1e6 / hz), now_s)
+        for msgid, interval_us in self.streams.items():
+            ops.set_message_interval(msgid, interval_us, now_s)
         if self._flight.calibration is not None:
             ops.set_message_interval(ATTITUDE_TARGET, int(1e6 / HOLD_THRUST_HZ), now_s)
         self._version = ops.request_message(codec.AUTOPILOT_VERSION, now_s)

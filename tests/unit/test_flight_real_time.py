@@ -32,6 +32,7 @@ from sim_link.vehicle_file import load
 START_NS = 5_000_000_000
 STATE_PERIOD_NS = 10_000_000
 ODOMETRY, TIMESYNC = codec.ID_ODOMETRY, codec.ID_TIMESYNC
+COMMAND_LONG, GPS_RAW_INT, ATTITUDE_QUATERNION, SET_MESSAGE_INTERVAL = 76, 24, 31, 511
 
 
 class VirtualWire:
@@ -192,6 +193,26 @@ def test_whole_flight(flight: Flight, wire: VirtualWire) -> None:
     assert len(stamps) == len(set(stamps))
     age = record.column("state_age_ms")
     assert 15.0 < age.min() <= age.max() < 45.0  # 20 ms old, and up to a period of the grid
+
+
+def intervals(wire: VirtualWire, msgid: int) -> list[float]:
+    """What was asked for as the interval of a message [us], one after the other."""
+    asked = (m for _, number, m in wire.sent if number == COMMAND_LONG and m.command == SET_MESSAGE_INTERVAL)
+    return [m.param2 for m in asked if m.param1 == msgid]
+
+
+@pytest.mark.parametrize("exclusive", [True, False])
+def test_what_is_not_used_is_not_sent_where_nobody_else_listens(
+    flight: Flight, wire: VirtualWire, exclusive: bool
+) -> None:
+    """In flight; afterwards all is as it was."""
+    link = flight.vehicle.link.model_copy(update={"exclusive": exclusive})
+    alone = flight.model_copy(update={"vehicle": flight.vehicle.model_copy(update={"link": link})})
+    outcome, _ = fly(alone, wire)
+    assert outcome.cause is Cause.COMPLETED, outcome.sentence
+    assert intervals(wire, GPS_RAW_INT) == ([-1.0, 0.0] if exclusive else [])
+    # the attitudes of this vehicle are never newer than its states
+    assert intervals(wire, ATTITUDE_QUATERNION) == ([3200.0, -1.0, 0.0] if exclusive else [3200.0, 0.0])
 
 
 def test_timesync_is_answered_after_the_setpoint(flight: Flight, wire: VirtualWire) -> None:

@@ -1,0 +1,56 @@
+"""A stream of attitudes is given up where none is newer than the state it comes with."""
+
+import pytest
+
+from companion.flight.attitudes import STATES_JUDGED, Attitudes
+
+
+def judged(attitudes: Attitudes, age_us: int, behind_ns: int, states: int = STATES_JUDGED + 10) -> list[int]:
+    """Which of so many states, 10 ms apart, told that the stream is of no use.
+
+    Args:
+        attitudes: the judge.
+        age_us: how much older than an attitude the state is that it comes with.
+        behind_ns: how long after it the attitude comes; below zero: before it.
+    """
+    said = []
+    for i in range(states):
+        t_us, wall_ns = 10_000 * i, 10_000_000 * i
+        if behind_ns < 0:
+            attitudes.on_attitude(t_us + age_us, wall_ns + behind_ns)
+        if attitudes.waste(t_us, wall_ns):
+            said.append(i)
+        if behind_ns >= 0:
+            attitudes.on_attitude(t_us + age_us, wall_ns + behind_ns)
+    return said
+
+
+@pytest.mark.parametrize("behind_ns", [-3_000_000, -10_000, 10_000, 900_000])
+def test_newer_ones_are_of_use(behind_ns: int) -> None:
+    """As of PX4, whose states are 18 ms old and whose attitudes come right behind them."""
+    assert judged(Attitudes(), 15_000, behind_ns) == []
+
+
+@pytest.mark.parametrize("behind_ns", [-3_000_000, -10_000, 10_000, 900_000, 4_000_000])
+def test_others_are_given_up_once(behind_ns: int) -> None:
+    (state,) = judged(Attitudes(), 0, behind_ns)
+    assert STATES_JUDGED <= state <= STATES_JUDGED + 2
+
+
+def test_those_between_two_states_are_newer_than_neither_when_it_is_answered() -> None:
+    """Of a simulated vehicle with 100 states and 250 attitudes per second, all of them without age."""
+    assert len(judged(Attitudes(), 4_000, 4_000_000)) == 1
+
+
+def test_without_attitudes_nothing_is_said() -> None:
+    attitudes = Attitudes()
+    assert not any(attitudes.waste(10_000 * i, 10_000_000 * i) for i in range(2 * STATES_JUDGED))
+
+
+def test_a_few_accidents_do_not_keep_the_stream() -> None:
+    attitudes = Attitudes()
+    said = []
+    for i in range(STATES_JUDGED + 10):
+        attitudes.on_attitude(10_000 * i + (5_000 if i % 20 == 0 else 0), 10_000_000 * i - 1000)
+        said.append(attitudes.waste(10_000 * i, 10_000_000 * i))
+    assert sum(said) == 1
