@@ -16,7 +16,7 @@ import dis
 import hashlib
 import importlib.util
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, MutableSequence
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
@@ -60,6 +60,16 @@ def resolve(engine: str) -> str:
 def choose(function: Callable[..., Any], engine: str) -> Callable[..., Any]:
     """Return a kernel as it is to run: the plain function, or its compiled twin."""
     return compile_kernel(function) if resolve(engine) == "numba" else function
+
+
+def numbers(size: int, engine: str) -> MutableSequence[float]:
+    """Return zeros for kernels to work on: a list for plain Python, an array for compiled code."""
+    if resolve(engine) != "numba":
+        return [0.0] * size
+    import numpy as np
+
+    array: MutableSequence[float] = np.zeros(size)  # type: ignore[assignment]  # what is used of a sequence it has
+    return array
 
 
 def compile_kernel(function: Callable[..., Any]) -> Callable[..., Any]:

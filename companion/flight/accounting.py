@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from companion.config import Flight
 from companion.control import flat
@@ -15,7 +15,8 @@ from companion.control.types import Quat, Vec3, new_record
 from companion.flight.clock import VehicleClock
 from companion.flight.course import Course
 from companion.flight.guards import Finding
-from companion.flight.phases import Autopilot, Phase
+from companion.flight.phases import PHASE_INDEX, Autopilot, Phase
+from companion.flight.reckoning import Reckoner
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.tracker import Target, TrackerStep
 from companion.flight.watch import Seen, Watch
@@ -59,7 +60,8 @@ class FlownStep(NamedTuple):
     """A control step whose setpoint is out."""
 
     state: VehicleState
-    out: TrackerStep
+    out: TrackerStep | None
+    """None: it was made by reflex, and nobody has looked at it yet."""
     course: Course
     course_s: float
     """Time since engaging [s]."""
@@ -93,6 +95,7 @@ class Accounting:
         peer: whether the vehicle waits for us.
         clock: the vehicle's.
         progress: called at most ten times per second of wall time; must not block.
+        engine: "python" or "numba".
     """
 
     def __init__(
@@ -104,10 +107,13 @@ class Accounting:
         peer: PacedPeer,
         clock: VehicleClock,
         progress: Callable[[Progress], None],
+        engine: str = "python",
     ) -> None:
         self._record, self._watch, self._autopilot = record, watch, autopilot
         self._peer, self._clock = peer, clock
         self._progress = progress
+        self._reckoner = None if engine != "numba" else Reckoner()
+        self._phase, self._phase_index = Phase.TRACK, PHASE_INDEX[Phase.TRACK]
         self._late_ns = int(LATE_SHARE / flight.vehicle.link.state_rate_hz * 1e9)
         self._shown_ns = 0
 
@@ -119,21 +125,52 @@ class Accounting:
             sent_ns: when its setpoint went out, `time.monotonic_ns()`.
             asked_ns: the vehicle's time when it asked for our answer in lockstep [ns]; None elsewhere.
         """
-        state, arrival_ns, took_ns = step.state, step.arrival_ns, sent_ns - step.arrival_ns
+        state, took_ns = step.state, sent_ns - step.arrival_ns
+        assert step.out is not None
         target = step.out.target
         if target is None:
             reference = step.course.at(step.course_s)
             target = Target(reference.p, reference.v)
         p, d = state.p, target.p
-        age_s: float | None
-        if asked_ns is not None:
-            age_ns = asked_ns - state.t_vehicle_us * 1000
-            age_s, sent_age_ms = age_ns * 1e-9, (age_ns + took_ns) * 1e-6
-        else:
-            age_s = self._watch.age_s(state.t_vehicle_us, arrival_ns)
-            sent_age_ms = (self._clock.now_s(sent_ns) - state.t_vehicle_us * 1e-6) * 1e3
+        age_s, sent_age_ms = self._ages(state.t_vehicle_us, step.arrival_ns, sent_ns, asked_ns)
         timing = new_record(StepTiming, (sent_age_ms, took_ns * 1e-3, took_ns > self._late_ns, step.skipped))
         return new_record(Measured, (target, (p[0] - d[0], p[1] - d[1], p[2] - d[2]), timing, age_s))
+
+    def _ages(self, t_us: int, arrival_ns: int, sent_ns: int, asked_ns: int | None) -> tuple[float | None, float]:
+        """How old a state was when it arrived [s], None where no clock tells it, and when its answer went out [ms]."""
+        if asked_ns is not None:
+            age_ns = asked_ns - t_us * 1000
+            return age_ns * 1e-9, (age_ns + sent_ns - arrival_ns) * 1e-6
+        return self._watch.age_s(t_us, arrival_ns), (self._clock.now_s(sent_ns) - t_us * 1e-6) * 1e3
+
+    def reckon(self, step: FlownStep, z: Any, m: Any, sent_ns: int, asked_ns: int | None, state_s: float) -> bool:
+        """Records a step by reflex, if nothing else is to be done about it; see `flight.reckoning`.
+
+        Args:
+            step: that was flown.
+            z: of the reflex.
+            m: of the step; None where its reference was not on the curve.
+            sent_ns: when its setpoint went out, `time.monotonic_ns()`.
+            asked_ns: the vehicle's time when it asked for our answer in lockstep [ns]; None elsewhere.
+            state_s: vehicle time at the arrival of its state [s].
+        """
+        calm = self._watch.calm(state_s)
+        if calm is None or m is None or self._reckoner is None or sent_ns - self._shown_ns > PROGRESS_NS:
+            return False
+        state, _, _, _, phase, track_s, _, arrival_ns = step
+        age_s, sent_age_ms = self._ages(state.t_vehicle_us, arrival_ns, sent_ns, asked_ns)
+        took_ns = sent_ns - arrival_ns
+        late = took_ns > self._late_ns
+        if phase is not self._phase:
+            self._phase, self._phase_index = phase, PHASE_INDEX[phase]
+        shown_s = track_s if phase is Phase.TRACK else math.nan
+        given = (shown_s, self._phase_index, sent_age_ms, took_ns * 1e-3, late, state_s, calm.delay_s, *calm.limits)
+        row = self._reckoner.step(z, m, given, calm.envelope, calm.following)
+        if row is None:
+            return False
+        self._record.append_packed(row)
+        self._watch.on_calm_step(age_s, state_s, late=late)
+        return True
 
     def settle(self, step: FlownStep, measured: Measured, state_s: float) -> Finding | None:
         """Records and judges a step; what is to be done about it.
@@ -144,9 +181,11 @@ class Accounting:
             state_s: vehicle time at the arrival of its state [s].
         """
         target, error, timing, age_s = measured
+        assert step.out is not None
         shown_s = step.track_s if step.phase is Phase.TRACK else math.nan
         self._record.append(control_row(shown_s, step.phase, step.state, target, error, step.out, timing))
         state, out, course, _, _, _, skipped, arrival_ns = step
+        assert out is not None
         seen = new_record(Seen, (state, error, out, skipped, timing.late, age_s, arrival_ns, self._peer.paced))
         return self._watch.on_step(seen, course, state_s)
 
@@ -159,6 +198,7 @@ class Accounting:
         return True
 
     def _standing(self, step: FlownStep, measured: Measured) -> Progress:
+        assert step.out is not None
         course, n, state = step.course, step.out.numbers, step.state
         north, east, down = n[flat.B_HAT]
         return Progress(

@@ -13,9 +13,11 @@ that V_H does not grow, and the envelope is its value at the start in place of t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from companion import accelerate
 from companion.control import flat
 from companion.control.certificate import FloatArray, linear_loop
 from companion.control.law import Gains
@@ -28,6 +30,18 @@ STRIDES = 120
 """The decay is tabulated over 6 s; afterwards it stays at its last value."""
 _SUBSTEPS = 5
 
+# where things stand among the numbers
+START = 0
+"""When the errors at the start were seen, vehicle time [s]; NaN before that."""
+INSIDE = 1
+"""1: they were within p_max."""
+P_MAX = 2
+ROOTS, STEP_ROOTS = 3, 5
+"""Horizontal and vertical: square roots of V at the start, and of what the configured steps give [m]."""
+DECAY = 7
+"""Norms of exp(A t) at the strides."""
+SIZE = DECAY + STRIDES + 1
+
 
 class Envelope:
     """The envelope of one gain set.
@@ -36,21 +50,23 @@ class Envelope:
         gains: that are flown.
         drag: D [1/s].
         step_m_s2: the configured disturbance step, horizontal and vertical [m/s^2].
+        engine: "python" or "numba".
     """
 
-    def __init__(self, gains: Gains, drag: float, step_m_s2: tuple[float, float]) -> None:
-        self._p_max = gains.p_max
-        self._decay, peak = _linear(gains, drag)
+    def __init__(self, gains: Gains, drag: float, step_m_s2: tuple[float, float], engine: str = "python") -> None:
+        decay, peak = _linear(gains, drag)
         self.step_roots = tuple(step * math.sqrt(ROOM * peak) for step in step_m_s2)
         """Square roots of what the configured steps give, horizontal and vertical [m]."""
-        self._start_s: float | None = None
-        self._inside = False
-        self._roots = (0.0, 0.0)
+        self.numbers = n = accelerate.numbers(SIZE, engine)
+        """What the kernels below work on."""
+        n[P_MAX], n[STEP_ROOTS], n[STEP_ROOTS + 1] = gains.p_max, *self.step_roots
+        n[DECAY:SIZE] = decay
         self._whole = 0.0
+        self.restart()
 
     def restart(self) -> None:
         """The next errors are those at the start: after engaging, a reset of the estimate, a change of the gains."""
-        self._start_s = None
+        self.numbers[START] = math.nan
 
     def excess(self, numbers: tuple[float, ...], now_s: float) -> tuple[float, float, str] | None:
         """V_H or a part of it that is above the envelope: the value, the envelope [m^2] and the part; None: within.
@@ -61,29 +77,57 @@ class Envelope:
             numbers: of a step (`control.flat`).
             now_s: vehicle time [s].
         """
-        x, y, z, x2, y2, z2, x3, y3, z3, x4, y4, z4 = numbers[flat.ERRORS]
-        inside = x * x + y * y + z * z <= self._p_max * self._p_max
-        if self._start_s is None or (inside and not self._inside):
+        n, errors = self.numbers, numbers[flat.ERRORS]
+        inside = is_inside(n, errors, 0)
+        if math.isnan(n[START]) or (inside and n[INSIDE] < 0.5):
             # Where the bound of the position error ends the linear loop begins, with the errors that are there.
-            self._start_s, self._inside, self._whole = now_s, inside, numbers[flat.LYAPUNOV]
-            level = x * x + x2 * x2 + x3 * x3 + x4 * x4 + y * y + y2 * y2 + y3 * y3 + y4 * y4
-            self._roots = math.sqrt(0.5 * level), math.sqrt(0.5 * (z * z + z2 * z2 + z3 * z3 + z4 * z4))
+            n[START], n[INSIDE], self._whole = now_s, float(inside), numbers[flat.LYAPUNOV]
+            horizontal, vertical = parts(errors, 0)
+            n[ROOTS], n[ROOTS + 1] = math.sqrt(horizontal), math.sqrt(vertical)
             return None
-        if not (inside and self._inside):
+        if not (inside and n[INSIDE] > 0.5):
             value = numbers[flat.LYAPUNOV]
             most = (math.sqrt(self._whole) + self.step_roots[0]) ** 2
             return (value, most, "all axes") if value > most else None
-        stride = int((now_s - self._start_s) / STRIDE_S)
-        decay = self._decay[stride if stride < STRIDES else STRIDES]
-        vertical = 0.5 * (z * z + z2 * z2 + z3 * z3 + z4 * z4)
-        root = decay * self._roots[1] + self.step_roots[1]
-        vertical_most = root * root
-        horizontal = 0.5 * (x * x + x2 * x2 + x3 * x3 + x4 * x4 + y * y + y2 * y2 + y3 * y3 + y4 * y4)
-        root = decay * self._roots[0] + self.step_roots[0]
-        horizontal_most = root * root
+        horizontal, vertical = parts(errors, 0)
+        horizontal_most, vertical_most = bounds(n, now_s)
         if vertical > vertical_most and vertical * horizontal_most >= horizontal * vertical_most:
             return vertical, vertical_most, "vertical"
         return (horizontal, horizontal_most, "horizontal") if horizontal > horizontal_most else None
+
+
+def is_inside(n: Sequence[float], e: Sequence[float], at: int) -> bool:
+    """Whether the position error, the first of the twelve errors that begin at a place, is within p_max. A kernel."""
+    x, y, z = e[at], e[at + 1], e[at + 2]
+    return x * x + y * y + z * z <= n[P_MAX] * n[P_MAX]
+
+
+def parts(e: Sequence[float], at: int) -> tuple[float, float]:
+    """V_H within p_max, horizontal and vertical, of twelve errors (e1 to e4) that begin at a place [m^2]. A kernel."""
+    x, y, z, x2, y2, z2 = e[at], e[at + 1], e[at + 2], e[at + 3], e[at + 4], e[at + 5]
+    x3, y3, z3, x4, y4, z4 = e[at + 6], e[at + 7], e[at + 8], e[at + 9], e[at + 10], e[at + 11]
+    horizontal = x * x + x2 * x2 + x3 * x3 + x4 * x4 + y * y + y2 * y2 + y3 * y3 + y4 * y4
+    return 0.5 * horizontal, 0.5 * (z * z + z2 * z2 + z3 * z3 + z4 * z4)
+
+
+def bounds(n: Sequence[float], now_s: float) -> tuple[float, float]:
+    """The envelope within p_max, horizontal and vertical, at a vehicle time [m^2]. A kernel."""
+    stride = int((now_s - n[START]) / STRIDE_S)
+    decay = n[DECAY + (stride if stride < STRIDES else STRIDES)]
+    horizontal, vertical = decay * n[ROOTS] + n[STEP_ROOTS], decay * n[ROOTS + 1] + n[STEP_ROOTS + 1]
+    return horizontal * horizontal, vertical * vertical
+
+
+def keeps(n: Sequence[float], e: Sequence[float], at: int, now_s: float) -> bool:
+    """Whether errors that begin at a place are within the envelope, and nothing begins with them. A kernel.
+
+    What it denies `Envelope.excess` looks at.
+    """
+    if not (n[INSIDE] > 0.5 and is_inside(n, e, at) and now_s >= n[START]):  # NaN before the start
+        return False
+    horizontal, vertical = parts(e, at)
+    horizontal_most, vertical_most = bounds(n, now_s)
+    return horizontal <= horizontal_most and vertical <= vertical_most
 
 
 def _linear(gains: Gains, drag: float) -> tuple[list[float], float]:

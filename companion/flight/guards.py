@@ -139,9 +139,11 @@ class Guards:
     Args:
         vehicle: for the limits.
         parameters: the law's; None where it does not fly.
+        engine: "python" or "numba".
     """
 
-    def __init__(self, vehicle: Vehicle, parameters: Parameters | None) -> None:
+    def __init__(self, vehicle: Vehicle, parameters: Parameters | None, engine: str = "python") -> None:
+        self._engine = engine
         self._vehicle, self._limits = vehicle, vehicle.limits
         self._since: dict[Guard, float] = {}
         self._answered: dict[Guard, int] = {}
@@ -151,7 +153,8 @@ class Guards:
         self._near = False
         """Whether the error was within the bound of the law once: a start from afar is not behind."""
         self._tilt_cosine = math.cos(vehicle.limits.tilt_max_rad)
-        self._envelope: Envelope | None = None
+        self.envelope: Envelope | None = None
+        """Of V_H; None where the law does not fly."""
         self._p_max, self._ball = vehicle.controller.position_error_max_m, vehicle.limits.disturbance_max_m_s2
         if parameters is not None:
             self.retune(parameters)
@@ -159,12 +162,21 @@ class Guards:
     def retune(self, parameters: Parameters) -> None:
         """Other gains are flown from now on."""
         self._p_max, self._ball = parameters.gains.p_max, parameters.limits.disturbance_max
-        self._envelope = Envelope(parameters.gains, parameters.model.drag, disturbance_step(self._limits))
+        self.envelope = Envelope(parameters.gains, parameters.model.drag, disturbance_step(self._limits), self._engine)
+
+    @property
+    def calm(self) -> tuple[float, float, float] | None:
+        """The largest error [m], smallest cosine of the tilt and largest error of the rates [rad/s] with which `step`
+        finds nothing, if the envelope is kept and nothing is saturated; None: `step` must look itself."""
+        if self._since or not self._near:
+            return None
+        limits = self._limits
+        return min(limits.position_error_abort_m, self._p_max), self._tilt_cosine, limits.rate_error_max_rad_s
 
     def restart(self) -> None:
         """The flight begins anew for the guards of the errors: the estimate was reset."""
-        if self._envelope is not None:
-            self._envelope.restart()
+        if self.envelope is not None:
+            self.envelope.restart()
 
     def step(
         self, q: Quat, error: Vec3, numbers: tuple[float, ...], now_s: float, rate_error: float = 0.0
@@ -202,8 +214,8 @@ class Guards:
         self._near = self._near or size < bound
         if flags or size > bound or since:
             found = _harder(found, self._strained(flags, size, numbers, now_s))
-        if self._envelope is not None:
-            excess = self._envelope.excess(numbers, now_s)
+        if self.envelope is not None:
+            excess = self.envelope.excess(numbers, now_s)
             if excess is not None:
                 found = _harder(found, self._beyond_envelope(excess, now_s))
             elif since and Guard.LYAPUNOV in since:
@@ -224,7 +236,7 @@ class Guards:
     def _strained(self, flags: int, size: float, numbers: tuple[float, ...], now_s: float) -> Finding | None:
         """Saturation, and an error beyond what the law reacts to."""
         limits, bound = self._limits, self._p_max
-        behind = self._envelope is not None and self._near and size > bound  # the bound is the law's
+        behind = self.envelope is not None and self._near and size > bound  # the bound is the law's
         found = self._judge(Guard.BEHIND, behind, size, bound, "m", now_s)
         disturbance = math.hypot(*numbers[flat.B_HAT])
         for guard, mask, value, limit, unit in (

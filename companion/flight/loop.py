@@ -348,7 +348,8 @@ class FlightLoop:
         self._silence_s = silence_limit_s(flight.vehicle.link.state_rate_hz)
 
     def _accounts(self, flight: Flight) -> Accounting:
-        return Accounting(flight, self._record, self._watch, self._autopilot, self._peer, self._clock, self._progress)
+        parts = (flight, self._record, self._watch, self._autopilot, self._peer, self._clock, self._progress)
+        return Accounting(*parts, engine=self._compiled.engine)
 
     def _begin(self) -> bool:
         """Begins the flight once the vehicle's time is known, and whether it waits for us."""
@@ -671,21 +672,21 @@ class FlightLoop:
         sent = self._wire.answer(datagram, wall_ns, sender, 2 if paced else 1, frames)
         self._sent_ns = time.monotonic_ns()
         self._reflexed = True
-        state, out = self._take_over(reflex, tracker, wall_ns)
+        state = self._take_over(reflex, tracker, wall_ns)
         if sent:
             self._sent_us = state.t_vehicle_us
             self._sender.sent += 1
-            self._flown(state, out, 0, wall_ns)
+            self._flown(state, None, 0, wall_ns)
             return True
         self._lost += 1
         if frames is None:
-            self._send(out.setpoint, state)  # which says what is wrong with it, and ends the flight
+            self._send(tracker.last_step().setpoint, state)  # which says what is wrong with it, and ends the flight
             if paced:
                 request = Timesync(0, reflex.asked_ns, 0, 0)
                 self._wire.send(codec.TIMESYNC, timesync.answer(request, time.monotonic_ns(), *sender))
         return True
 
-    def _take_over(self, reflex: Reflex, tracker: Tracker, wall_ns: int) -> tuple[VehicleState, TrackerStep]:
+    def _take_over(self, reflex: Reflex, tracker: Tracker, wall_ns: int) -> VehicleState:
         """What was answered by reflex becomes known, in the order of the usual way."""
         sequence, peer, clock = self._sequence, self._peer, self._clock
         state, numbers = reflex.told()
@@ -701,9 +702,10 @@ class FlightLoop:
         now_s = clock.now_s(wall_ns)
         self._last_state, self._last_state_s, self._last_arrival_ns = state, now_s, wall_ns
         sequence.on_state(state, now_s)
-        return state, tracker.answered(state.t_vehicle_us * 1e-6, new_record(State, state[1:5]))
+        tracker.answered(state.t_vehicle_us * 1e-6, new_record(State, state[1:5]))
+        return state
 
-    def _flown(self, state: VehicleState, out: TrackerStep, skipped: int, arrival_ns: int) -> None:
+    def _flown(self, state: VehicleState, out: TrackerStep | None, skipped: int, arrival_ns: int) -> None:
         """A setpoint is out; what it came from is accounted for later."""
         sequence = self._sequence
         assert sequence.course is not None
@@ -726,6 +728,12 @@ class FlightLoop:
             return
         if self._retuning is not None:
             self._retuning.tick()
+        if step.out is None:
+            assert self._reflex is not None and isinstance(self._tracker, Tracker)
+            work = self._reflex.numbers, self._tracker.numbers
+            if self._accounting.reckon(step, *work, self._sent_ns, self._asked_ns, self._last_state_s):
+                return
+            step = step._replace(out=self._tracker.last_step())
         measured = self._accounting.measure(step, self._sent_ns, self._asked_ns)
         finding = self._accounting.settle(step, measured, self._last_state_s)
         if finding is not None:

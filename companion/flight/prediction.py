@@ -33,9 +33,9 @@ class Prediction:
     """
 
     def __init__(self, thrust_lag_s: float, delay_s: float, thrust_n: float, engine: str = "python") -> None:
-        self.numbers: MutableSequence[float] = _numbers(history.CAPACITY, engine)
+        self.numbers: MutableSequence[float] = accelerate.numbers(history.CAPACITY, engine)
         """The history, as `control.history` lays it out."""
-        self._out = _numbers(history.PIECE * PIECES_MAX, engine)
+        self._out = accelerate.numbers(history.PIECE * PIECES_MAX, engine)
         self._thrust_lag_s = thrust_lag_s
         self._begin = accelerate.choose(history.begin, engine)
         self._remember = accelerate.choose(history.remember, engine)
@@ -99,12 +99,3 @@ class Prediction:
     def _commands(self) -> range:
         """Where the commands stand, the oldest first."""
         return range(int(self.numbers[history.BEGIN]), int(self.numbers[history.END]), history.COMMAND)
-
-
-def _numbers(size: int, engine: str) -> MutableSequence[float]:
-    if engine != "numba":
-        return [0.0] * size
-    import numpy as np
-
-    array: MutableSequence[float] = np.zeros(size)  # type: ignore[assignment]  # what is used of a sequence it has
-    return array

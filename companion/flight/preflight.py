@@ -211,7 +211,7 @@ class Preflight:
         self.meter = LinkMeter(silence_limit_s(flight.vehicle.link.state_rate_hz, calibrates=calibrates))
         """Measures the link; the loop tells it what comes."""
         self.streams: dict[int, int] = {}
-        """Intervals of further messages that are asked for at the beginning [us] (`Operations.set_message_interval`)."""
+        """Intervals of further messages, asked for at the beginning [us] (`Operations.set_message_interval`)."""
         self.findings: list[Finding] = []
         """Of all gates, once they have judged."""
         self._begun_s: float | None = None

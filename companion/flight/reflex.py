@@ -322,6 +322,11 @@ class Reflex:
         return new_record(VehicleState, state), numbers
 
     @property
+    def numbers(self) -> Any:
+        """What `reflex` works on."""
+        return self._z
+
+    @property
     def output(self) -> memoryview:
         """What is to be sent: the setpoint's frame, in lockstep with the answer's behind it."""
         return self._output[: self._longs[OUT_BYTES]]

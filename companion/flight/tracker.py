@@ -207,6 +207,7 @@ class CompiledEngine:
         self._no_history = np.zeros(history.CAPACITY)
         self._lags = lags
         self.retune(parameters)
+        self._doubles = m.data
         self._bytes = m.data.cast("B")
         self._pack = struct.Struct(f"{fused.INPUT + flat.THRUST_NOW}d").pack_into
         self._pack_reference = struct.Struct("18d").pack_into
@@ -303,7 +304,12 @@ class CompiledEngine:
     @property
     def on_curve(self) -> bool:
         """Whether the last step had its reference from a curve."""
-        return bool(self._m[fused.ON_CURVE] > 0.5)
+        return self._doubles[fused.ON_CURVE] > 0.5
+
+    @property
+    def refreshed(self) -> bool:
+        """Whether the last step predicted from an attitude newer than its state."""
+        return self._doubles[fused.REFRESHED] > 0.5
 
     def give_attitude(self, attitude: Attitude | None) -> None:
         """One that is newer than the next state, if there is one."""
@@ -378,6 +384,7 @@ class Tracker:
 
     def __init__(self, vehicle: Vehicle, output: str, compiled: Kernels) -> None:
         self.vehicle = vehicle
+        self.engine = compiled.engine
         self.parameters = vehicle.parameters()
         self._output, self._by_rates = output, output == "rates"
         x, y, z = vehicle.autopilot.rate_lag_s
@@ -497,12 +504,25 @@ class Tracker:
         r = whole.refer(timed, reflex.stamp_us * 1e-6, self.delay_s)
         return reflex.run(whole.numbers, self._prediction.numbers, r, last_s, self._gap_max_s)
 
-    def answered(self, stamp_s: float, state: State) -> TrackerStep:
-        """What the step did that `answer` has made for this state."""
+    def answered(self, stamp_s: float, state: State) -> None:
+        """The step that `answer` has made was for this state."""
         assert self._whole is not None
         self._last_s, self._seen = stamp_s, state
-        if self._attitude is not None and self._attitude.at_s <= stamp_s:
-            self._attitude = None
+        if self._attitude is not None:
+            if self._attitude.at_s <= stamp_s:
+                self._attitude = None
+            self.refreshed += self._whole.refreshed
+
+    @property
+    def numbers(self) -> Any:
+        """What the last step worked on (`fused.flight_step`), where it was one call and its reference on a curve; else
+        None."""
+        whole = self._whole
+        return whole.numbers if whole is not None and whole.on_curve else None
+
+    def last_step(self) -> TrackerStep:
+        """What the last step did, where it was one call."""
+        assert self._whole is not None
         return self._whole_step(*self._whole.results(), on_curve=self._whole.on_curve)
 
     def _step(self, start: WholeStep, reference_at: ReferenceAt, attitude: Attitude | None) -> TrackerStep:
@@ -524,12 +544,12 @@ class Tracker:
     ) -> TrackerStep:
         """The step as one call."""
         n, rest, on_curve = whole.fly(start, self._prediction, reference_at, attitude)
+        self.refreshed += whole.refreshed
         return self._whole_step(n, rest, on_curve=on_curve, dt_s=start.dt_s)
 
     def _whole_step(self, n: Numbers, rest: Numbers, *, on_curve: bool, dt_s: float = 0.0) -> TrackerStep:
         """What a step did that was one call."""
-        share, used, px, py, pz, vx, vy, vz = rest
-        self.refreshed += used > 0.5
+        share, _, px, py, pz, vx, vy, vz = rest
         setpoint = new_record(RateSetpoint, (share, _vec3(n[flat.RATES]))) if self._by_rates else self._convert(n, dt_s)
         return TrackerStep(setpoint, n, Target((px, py, pz), (vx, vy, vz)) if on_curve else None)
 

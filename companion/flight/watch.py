@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, MutableSequence, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +56,17 @@ class Seen(NamedTuple):
     """In lockstep: nothing is judged by the wall clock."""
 
 
+class Calm(NamedTuple):
+    """By what a step is found to need no judging (`flight.reckoning`)."""
+
+    limits: tuple[float, float, float]
+    """`Guards.calm`."""
+    delay_s: float
+    """From a stamp to the effect of its command."""
+    envelope: Sequence[float]
+    following: MutableSequence[float]
+
+
 BEHIND_NS = 5_000_000
 """Two clocks whose offset is followed are nearer to each other."""
 
@@ -85,9 +96,10 @@ class Watch:
         self.offset = OffsetFilter()
         self._tracker = controller if isinstance(controller, Tracker) else None
         self._controller, self._autopilot, self._limits = controller, autopilot, vehicle.limits
-        self._guards = Guards(vehicle, None if self._tracker is None else self._tracker.parameters)
+        engine = "python" if self._tracker is None else self._tracker.engine
+        self._guards = Guards(vehicle, None if self._tracker is None else self._tracker.parameters, engine)
         by_rates = self._tracker is not None and flight.output.sends == "rates"
-        self._following = Following(vehicle.autopilot.rate_lag_s) if by_rates else None
+        self._following = Following(vehicle.autopilot.rate_lag_s, engine) if by_rates else None
         """None where no body rates are commanded."""
         self._retuned = False
         self._steps = self._late = 0
@@ -152,15 +164,33 @@ class Watch:
         self._steps += 1
         self._late += late
         found = self._guards.step(state.q, error, out.numbers, now_s, self._rate_error(state, out.numbers))
-        if age_s is not None:
-            delay_s = self.delay.on_age(age_s, now_s)
-            if delay_s is not None and tracker is not None:
-                tracker.retime(delay_s)
+        self._on_age(age_s, now_s)
         if now_s - self._slowly_s < SLOWLY_S - 1e-6:
             return found
         self._slowly_s = now_s
         slow = self._guards.slowly(self._slow(seen, course, now_s), now_s)
         return slow if found is None or (slow is not None and slow.response > found.response) else found
+
+    def calm(self, now_s: float) -> Calm | None:
+        """By what a step can be found to need no judging; None: `on_step` is to judge it."""
+        following, envelope, limits = self._following, self._guards.envelope, self._guards.calm
+        if self._tracker is None or self._tracker.changing or self._retuned:
+            return None
+        if following is None or envelope is None or limits is None or now_s - self._slowly_s >= SLOWLY_S - 1e-6:
+            return None
+        return Calm(limits, self._tracker.delay_s, envelope.numbers, following.numbers)
+
+    def on_calm_step(self, age_s: float | None, now_s: float, *, late: bool) -> None:
+        """A control step was found to need no judging, by `calm`."""
+        self._steps += 1
+        self._late += late
+        self._on_age(age_s, now_s)
+
+    def _on_age(self, age_s: float | None, now_s: float) -> None:
+        """Follows the delay by the age of a state."""
+        delay_s = None if age_s is None else self.delay.on_age(age_s, now_s)
+        if delay_s is not None and self._tracker is not None:
+            self._tracker.retime(delay_s)
 
     def _rate_error(self, state: VehicleState, numbers: tuple[float, ...]) -> float:
         """How far the body rates are off the commanded ones [rad/s]; 0 where it is not known."""

@@ -65,7 +65,10 @@ class FlightRecord:
         A full record only counts (`overflow`). A row of another length or with something else than numbers is a fault
         of the program and raises struct.error.
         """
-        content = _ROW.pack(*row)
+        self.append_packed(_ROW.pack(*row))
+
+    def append_packed(self, content: bytes) -> None:
+        """Write one row that is packed already: a float64 per column, in the machine's own byte order."""
         length = self._length
         if length < self._capacity:
             at = length * _ROW.size

@@ -189,19 +189,19 @@ def test_a_flight_does_not_show_which_states_were_answered_by_reflex(tmp_path, m
 
 @pytest.mark.numba
 def test_a_setpoint_by_reflex_that_cannot_be_sent_ends_the_flight(tmp_path, monkeypatch) -> None:
-    answer, answered, left = Tracker.answer, Tracker.answered, [100]
+    answer, last_step, left = Tracker.answer, Tracker.last_step, [100]
 
     def count_down(tracker: Tracker, *given: Any) -> int:
         left[0] -= 1
         code = answer(tracker, *given)
         return UNSENDABLE if code == ANSWERED and left[0] <= 0 else code
 
-    def spoilt(tracker: Tracker, *given: Any) -> Any:
-        out = answered(tracker, *given)
+    def spoilt(tracker: Tracker) -> Any:
+        out = last_step(tracker)
         return out._replace(setpoint=out.setpoint._replace(thrust=math.nan)) if left[0] <= 0 else out
 
     monkeypatch.setattr(Tracker, "answer", count_down)
-    monkeypatch.setattr(Tracker, "answered", spoilt)
+    monkeypatch.setattr(Tracker, "last_step", spoilt)
     with Stand(make_flight(trajectory=dict(INDOOR)), tmp_path) as stand:
         flown = stand.fly(engine="numba")
         assert stand.mode is Mode.HOLD
