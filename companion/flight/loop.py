@@ -51,7 +51,7 @@ from companion.link.setpoint import SetpointSender, UnsendableSetpoint
 from companion.link.telemetry import StateRejection, Telemetry, VehicleState
 from companion.link.timesync import PacedPeer
 from companion.link.version import AutopilotVersion
-from companion.link.wire import Wire
+from companion.link.wire import Datagram, Wire
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.anchored import Trajectory
 
@@ -78,6 +78,8 @@ LOCKSTEP_SPIN_S = 0.0005
 HEARTBEAT_INTERVAL_S = 1.0
 IDLE_WAIT_S = 0.1
 BUSY_WAIT_S = 0.01
+_MSGID_AT = 7
+_ATTITUDE_LOW = bytes((codec.ATTITUDE_QUATERNION,))
 AWAY_NS = 25_000_000
 """A turn that lasts longer while setpoints are due: this process itself was stopped, and not the link silent."""
 
@@ -332,7 +334,7 @@ class FlightLoop:
         self._met = True
         if self._compiled.engine == "numba":
             self._reflex = Reflex(system, (self._wire.system_id, self._wire.component_id))
-            self._wire.at_once = self._answer_at_once
+            self._wire.at_once = self._use_at_once
 
     def _adapt(self, adaptation: Adaptation) -> None:
         """The loop as it was measured asks for other setpoints or gains: all that flies is made anew, on the ground or
@@ -645,14 +647,52 @@ class FlightLoop:
         self._sent_ns = time.monotonic_ns()
         self._flown(state, out, skipped, arrival_ns)
 
-    def _answer_at_once(self, datagram: bytes, wall_ns: int) -> bool:
+    def _use_at_once(self, datagrams: list[Datagram]) -> int:
+        """Uses what has come as far as it is attitudes and one ordinary state, which is answered; how many it was."""
+        tracker = self._tracker
+        if self._sequence.duty is not Duty.TRACK or not isinstance(tracker, Tracker):
+            return 0
+        used, count = self._use_attitudes(datagrams, 0, tracker), len(datagrams)
+        if used == count:
+            return used
+        for datagram in datagrams[used + 1 :]:  # what came behind a state may be newer than it
+            frame = self._attitude_in(datagram)
+            if frame is None:
+                return used
+            sample = self._telemetry.read_attitude(frame)
+            if not isinstance(sample, StateRejection):
+                tracker.refresh(Attitude(sample.t_vehicle_us * 1e-6, sample.q, sample.w))
+        if not self._answer_at_once(datagrams[used][0], datagrams[used][2], tracker):
+            return used
+        return self._use_attitudes(datagrams, used + 1, tracker)
+
+    def _attitude_in(self, datagram: Datagram) -> Frame | None:
+        """The autopilot's ATTITUDE_QUATERNION that is all of a datagram; None where it is anything else."""
+        if datagram[0][_MSGID_AT : _MSGID_AT + 1] != _ATTITUDE_LOW:
+            return None
+        frame = self._wire.look(datagram)
+        if frame is None or frame.msgid != codec.ATTITUDE_QUATERNION:
+            return None
+        return frame if (frame.sysid, frame.compid) == (self._ops.target_system, AUTOPILOT_COMPONENT) else None
+
+    def _use_attitudes(self, datagrams: list[Datagram], begin: int, tracker: Tracker) -> int:
+        """Uses the attitudes from a place on, none of them lost; returns where they end."""
+        for i in range(begin, len(datagrams)):
+            frame = self._attitude_in(datagrams[i])
+            if frame is None or frame.seq != self._wire.due(frame.sysid, frame.compid)[0]:
+                return i
+            self._wire.took(frame.raw, frame.arrival_wall_ns, (frame.sysid, frame.compid), 1)
+            self._heard_ns = frame.arrival_wall_ns
+            self._on_attitude(frame, tracker)
+        return len(datagrams)
+
+    def _answer_at_once(self, datagram: bytes, wall_ns: int, tracker: Tracker) -> bool:
         """Answers a datagram with an ordinary state by reflex; False: it is to take the usual way."""
-        sequence, telemetry, tracker, timed = self._sequence, self._telemetry, self._tracker, self._timed
+        sequence, telemetry, timed = self._sequence, self._telemetry, self._timed
         last, last_us, sent_us, before = self._last_state, telemetry.last_t_vehicle_us, self._sent_us, telemetry.numbers
-        if sequence.duty is not Duty.TRACK or timed is None or last is None or last_us is None or sent_us is None:
+        if timed is None or last is None or last_us is None or sent_us is None or before is None:
             return False
-        usual = telemetry.sound and self._pending is None and not (self._requests or sequence.preflight.meter.running)
-        if not usual or before is None or not isinstance(tracker, Tracker):
+        if not telemetry.sound or self._pending is not None or self._requests or sequence.preflight.meter.running:
             return False
         if timed.course is not sequence.course or timed.begin_s != sequence.engaged_at_s or not self._peer.settled:
             return False

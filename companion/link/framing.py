@@ -148,6 +148,21 @@ class FrameParser:
         last = self._last_seq.get(sysid << 8 | compid)
         return -1 if last is None else (last + 1) & 0xFF
 
+    def look(self, data: bytes, wall_ns: int) -> Frame | None:
+        """The one frame that a datagram is, if it is a good, unsigned MAVLink 2 frame of a message that we know; else
+        None. Nothing is counted."""
+        if len(data) < _HEADER_V2.size + 2 or data[0] != MAGIC_V2 or data[2] != 0:
+            return None
+        _, length, _, _, seq, sysid, compid, low, high = _HEADER_V2.unpack_from(data)
+        known = self._formats.get(low | high << 16)
+        stop = _HEADER_V2.size + length
+        if known is None or len(data) != stop + 2:
+            return None
+        if mcrf4xx(data[1:stop] + _CRC_EXTRA[known.crc_extra]) != data[stop] | data[stop + 1] << 8:
+            return None
+        payload = data[_HEADER_V2.size : stop].ljust(known.length, b"\0")
+        return new_record(Frame, (low | high << 16, sysid, compid, seq, payload, data, wall_ns))
+
     def took(self, sysid: int, compid: int, count: int) -> None:
         """So many frames of a sender, the ones that were due, were checked and used elsewhere."""
         self._counters.received += count

@@ -200,15 +200,15 @@ class Telemetry:
 
     def on_attitude(self, frame: Frame) -> AttitudeSample | StateRejection:
         """Judge an ATTITUDE_QUATERNION frame; its stamps are compared with its own kind's."""
-        sample = self._read_attitude(frame)
+        sample = self.read_attitude(frame)
         if isinstance(sample, StateRejection):
             self.rejected[sample] += 1
         elif self._last_us is not None:  # before the first state nothing says whether the stamp is sound
             self._attitude_us = sample.t_vehicle_us
         return sample
 
-    def _read_attitude(self, frame: Frame) -> AttitudeSample | StateRejection:
-        """The attitude in the message, or what is wrong with it."""
+    def read_attitude(self, frame: Frame) -> AttitudeSample | StateRejection:
+        """The attitude in an ATTITUDE_QUATERNION frame, or what is wrong with it; nothing is counted or remembered."""
         if frame.sysid != self.system_id or frame.compid != self.component_id:
             return StateRejection.NOT_FROM_AUTOPILOT
         message = decode_attitude_quaternion(frame.payload)

@@ -33,6 +33,8 @@ Tap = Callable[[int, bytes, int], object]
 """Called with direction, raw frame and `time.monotonic_ns()` for every frame used or sent, and unknown ones; not for
 those that carry a key. In the order of the traffic, but only when the wire has nothing to do (`Wire.tell`)."""
 
+Datagram = tuple[bytes, Address | None, int]
+"""With its sender and its arrival, `time.monotonic_ns()`."""
 TAP_IN: Final = 0
 TAP_OUT: Final = 3  # the numbers that a traffic log (.tlog) has for the directions
 
@@ -73,9 +75,10 @@ class Wire:
         """Whom we talk to; None until a valid frame came (and always on a serial line)."""
         self.last_foreign: Address | None = None
         """Who else sent to our port, if anybody, for the explanation of a silent vehicle."""
-        self.at_once: Callable[[bytes, int], bool] | None = None
-        """Asked about a datagram of the peer that comes alone, with its arrival, before it is parsed: whether it was
-        used. For who answers the usual one without any detour. Never on a serial line, nor where frames are signed."""
+        self.at_once: Callable[[list[Datagram]], int] | None = None
+        """Asked about datagrams of the peer that have come, before they are parsed: how many of them, from the first
+        one on, were used. For who answers the usual ones without any detour. Never on a serial line, nor where frames
+        are signed."""
         self._transport = transport
         self._tap = tap
         self._untold: list[tuple[int, bytes, int]] = []
@@ -88,8 +91,8 @@ class Wire:
         self._gathered: list[bytes] | None = None
         self._owned: KeptSigner | None = None
         self._kept: list[Frame] = []
-        self._unread: list[tuple[bytes, Address | None, int]] = []
-        """Datagrams that were read and not used yet, with their sender and arrival."""
+        self._unread: list[Datagram] = []
+        """Datagrams that were read and not used yet."""
         self._heard_ns = self._greeted_ns = 0
         self._outdated = 0
         self._poll = select.poll()
@@ -216,12 +219,7 @@ class Wire:
                 if address == self.peer and data[:1] == _V2 and int.from_bytes(data[_MSGID], "little") in until:
                     end = i + 1
                     break
-        if end == 1:
-            data, address, wall_ns = unread.pop(0)
-            self._use_datagram(data, address, wall_ns, frames, unknown)
-            return
-        for data, address, wall_ns in unread[:end]:
-            self._parse_datagram(data, address, wall_ns, frames, unknown)
+        self._use_datagrams(unread[:end], frames, unknown)
         del unread[:end]
 
     def keep(self, frames: list[Frame]) -> None:
@@ -241,7 +239,7 @@ class Wire:
         if self._line is not None:
             self._parse_stream(self._line, got[0], wall_ns, frames, unknown)
         else:
-            self._use_datagram(got[0], got[1], wall_ns, frames, unknown)
+            self._use_datagrams([(*got, wall_ns)], frames, unknown)
         return True
 
     def _spin(self, spin_s: float, frames: list[Frame], unknown: list[bytes]) -> bool:
@@ -255,13 +253,14 @@ class Wire:
                 return True
         return False
 
-    def _use_datagram(
-        self, data: bytes, address: Address | None, wall_ns: int, frames: list[Frame], unknown: list[bytes]
-    ) -> None:
-        """Use a datagram before which nothing waits to be used."""
-        if self.at_once is not None and address == self.peer and self._guard is None and self.at_once(data, wall_ns):
-            self._heard_ns = wall_ns
-        else:
+    def _use_datagrams(self, datagrams: list[Datagram], frames: list[Frame], unknown: list[bytes]) -> None:
+        """Use datagrams before which nothing waits to be used."""
+        used = 0
+        if self.at_once is not None and self._guard is None and all(sent[1] == self.peer for sent in datagrams):
+            used = self.at_once(datagrams)
+            if used:
+                self._heard_ns = datagrams[used - 1][2]
+        for data, address, wall_ns in datagrams[used:]:
             self._parse_datagram(data, address, wall_ns, frames, unknown)
 
     def _parse_datagram(
@@ -382,6 +381,23 @@ class Wire:
                 self.tell()
         return True
 
+    def look(self, datagram: Datagram) -> Frame | None:
+        """The one good frame that a datagram is, for `at_once`; None where it is anything else. Nothing is counted."""
+        return self._parser.look(datagram[0], datagram[2])
+
+    def took(self, datagram: bytes, wall_ns: int, sender: tuple[int, int], count: int) -> None:
+        """Note a datagram that `at_once` was asked about and that was used.
+
+        Args:
+            datagram: its frames were checked, are all of the sender, and were due.
+            wall_ns: when it arrived.
+            sender: its system and component id.
+            count: how many frames are in it.
+        """
+        self._parser.took(*sender, count)
+        if self._tap is not None:
+            self._untold.append((TAP_IN, datagram, wall_ns))
+
     def due(self, sysid: int, compid: int) -> tuple[int, int]:
         """The sequence numbers that are due: of a sender's next frame if none is lost (-1 before its first), and of our
         own."""
@@ -390,10 +406,10 @@ class Wire:
     def answer(
         self, datagram: bytes, wall_ns: int, sender: tuple[int, int], count: int, frames: memoryview | None
     ) -> bool:
-        """Send what answers a datagram that `at_once` was asked about.
+        """Send what answers a datagram that `at_once` was asked about, and note that it was used; see `took`.
 
         Args:
-            datagram: that is answered; its frames were checked, are all of the sender, and were due.
+            datagram: that is answered.
             wall_ns: when it arrived.
             sender: its system and component id.
             count: how many frames are in it, and in the answer.
@@ -404,9 +420,7 @@ class Wire:
         """
         raw = None if frames is None else frames.tobytes()
         out = raw is not None and self._write(raw)
-        self._parser.took(*sender, count)
-        if self._tap is not None:
-            self._untold.append((TAP_IN, datagram, wall_ns))
+        self.took(datagram, wall_ns, sender, count)
         if raw is None or not out:
             self.counters.send_dropped += raw is not None
             return False

@@ -165,11 +165,11 @@ def test_a_flight_does_not_show_which_states_were_answered_by_reflex(tmp_path, m
     flight = make_flight(trajectory=dict(INDOOR) | {"duration_s": 2.0}, world__force_n=[2.0, 0.0, 0.0])
     answer, answered = FlightLoop._answer_at_once, []
 
-    def counted(loop: FlightLoop, datagram: bytes, wall_ns: int) -> bool:
-        answered.append(answer(loop, datagram, wall_ns))
+    def counted(loop: FlightLoop, *given: Any) -> bool:
+        answered.append(answer(loop, *given))
         return answered[-1]
 
-    def never(loop: FlightLoop, datagram: bytes, wall_ns: int) -> bool:
+    def never(loop: FlightLoop, *given: Any) -> bool:
         return False
 
     flights, setpoints = [], []
