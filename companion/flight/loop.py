@@ -23,7 +23,6 @@ from companion.control.types import State, new_record
 from companion.errors import LinkError
 from companion.flight.accounting import Accounting, FlownStep, Progress
 from companion.flight.adaptation import Adaptation, adapted
-from companion.flight.attitudes import Attitudes
 from companion.flight.calibration import Calibrator
 from companion.flight.clock import VehicleClock
 from companion.flight.coast import coast_setpoint
@@ -40,13 +39,14 @@ from companion.flight.reports import hover_thrust_n, take_heartbeat, take_report
 from companion.flight.responses import respond
 from companion.flight.retuning import ParameterChange, Retuning
 from companion.flight.sequence import Duty, Sequence
+from companion.flight.streams import Streams
 from companion.flight.tracker import Kernels, Tracker, TrackerStep
 from companion.flight.watch import Watch
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
 from companion.link.codec import Timesync
 from companion.link.framing import Frame
-from companion.link.operations import DEFAULT_INTERVAL, STOP_MESSAGE, Command, Operations
+from companion.link.operations import Operations
 from companion.link.setpoint import SetpointSender, UnsendableSetpoint
 from companion.link.telemetry import StateRejection, Telemetry, VehicleState
 from companion.link.timesync import PacedPeer
@@ -64,12 +64,6 @@ OFFBOARD_LOSS_S = 1.0
 PACE_STATES = 15
 PACE_WALL_S = 3.0
 """A vehicle in lockstep shows itself within so many states; without any, so long is waited for them."""
-NOT_NEEDED = (24, 30, 32, 33, 36, 62, 65, 74, 85, 87, 105, 141)
-"""Streams that a flight does not use: GPS_RAW_INT, ATTITUDE, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW,
-NAV_CONTROLLER_OUTPUT, RC_CHANNELS, VFR_HUD, POSITION_TARGET_LOCAL_NED, POSITION_TARGET_GLOBAL_INT, HIGHRES_IMU,
-ALTITUDE. In lockstep they cost a third of the time, elsewhere six datagrams in seven."""
-ATTITUDE_INTERVAL_US = 3_200
-"""Of ATTITUDE_QUATERNION, which refreshes the rotation that is predicted: PX4 has one at each of its 4 ms."""
 FLOWN_ON = frozenset((codec.ODOMETRY, codec.ATTITUDE_QUATERNION))
 """What a setpoint is computed from: what comes behind the newest of them is read when that is answered. So a change of
 the mode that came together with a state, and behind it, is known one setpoint later."""
@@ -173,9 +167,8 @@ class FlightLoop:
         self._engagement: Engagement | None = None
         self._delays_told = 0
         self._sent_ns = 0
-        self._exclusive = False
-        """Whether nobody else listens on this link: what is not used is not sent."""
-        self._attitudes = Attitudes()
+        self._streams: Streams | None = None
+        """Once it is known whether the vehicle waits."""
         self._asked_ns: int | None = None
         """The vehicle's time when it last asked for our answer in lockstep [ns]; None elsewhere."""
         self._watch = Watch(flight, self._tracker, self._autopilot, notify)
@@ -248,7 +241,8 @@ class FlightLoop:
             cause, detail, fault = Cause.FAULT, f"{type(error).__name__}: {error}", traceback.format_exc()
         try:
             detail = self._leave(detail)
-            self._leave_the_link()
+            if self._streams is not None:
+                self._streams.leave(self._wire, self._ops.target_system, AUTOPILOT_COMPONENT)
         finally:
             gc.enable()
             gc.unfreeze()
@@ -295,18 +289,6 @@ class FlightLoop:
         taken = ask_for_hold(self._wire, self._ops.target_system)
         how = "handed over to Hold" if taken else "Hold was not acknowledged, the autopilot's own failsafe acts"
         return f"{detail}; {how}".lstrip("; ")
-
-    def _leave_the_link(self) -> None:
-        """Streams that were switched off come again at their usual rates, if the requests arrive; nobody waits."""
-        if not self._exclusive or self._peer.paced:
-            return
-        with contextlib.suppress(Exception):
-            for msgid in (*NOT_NEEDED, codec.ATTITUDE_QUATERNION):
-                params = (float(msgid), float(DEFAULT_INTERVAL), *(0.0,) * 5)
-                system = self._ops.target_system
-                command = Command.SET_MESSAGE_INTERVAL
-                payload = codec.encode_command_long(system, AUTOPILOT_COMPONENT, command, 0, params)
-                self._wire.send(codec.COMMAND_LONG, payload)
 
     # -- connecting -----------------------------------------------------------------------------------------------
 
@@ -373,13 +355,9 @@ class FlightLoop:
         self._sequence.enter(Phase.PREFLIGHT, now_s, "asking for rates, version and parameters")
         self._paced(self._peer.paced)
         paced = self._peer.paced
-        self._exclusive = paced or (self._flight.vehicle.link.exclusive and isinstance(self._host, Alone))
-        streams = dict.fromkeys(NOT_NEEDED, STOP_MESSAGE) if self._exclusive else {}
-        if paced:  # each state is answered before anything newer comes
-            streams[codec.ATTITUDE_QUATERNION] = STOP_MESSAGE
-        elif isinstance(self._tracker, Tracker):
-            streams[codec.ATTITUDE_QUATERNION] = ATTITUDE_INTERVAL_US
-        self._sequence.preflight.streams = streams
+        exclusive = self._flight.vehicle.link.exclusive and isinstance(self._host, Alone)
+        self._streams = Streams(exclusive=exclusive, paced=paced, predicts=isinstance(self._tracker, Tracker))
+        self._sequence.preflight.streams = self._streams.intervals_us
         return True
 
     # -- one turn -------------------------------------------------------------------------------------------------
@@ -460,10 +438,9 @@ class FlightLoop:
         self._pending_wall_ns = frame.arrival_wall_ns
         self._peer.on_state(state.t_vehicle_us)
         self._clock.on_state(state.t_vehicle_us, frame.arrival_wall_ns)
-        if self._attitudes.waste(state.t_vehicle_us, frame.arrival_wall_ns):
-            interval_us = STOP_MESSAGE if self._exclusive else DEFAULT_INTERVAL
+        if self._streams is not None:
             now_s = self._clock.now_s(frame.arrival_wall_ns)
-            self._ops.set_message_interval(codec.ATTITUDE_QUATERNION, interval_us, now_s)
+            self._streams.on_state(state.t_vehicle_us, frame.arrival_wall_ns, self._ops, now_s)
         meter = self._sequence.preflight.meter
         if meter.running:
             meter.on_state(state, self._clock.now_s(frame.arrival_wall_ns), paced=self._peer.paced)
@@ -472,7 +449,8 @@ class FlightLoop:
         """One that is newer than the state which is answered next refreshes the prediction, and asks for no answer."""
         sample = self._telemetry.on_attitude(frame)
         if not (self._peer.paced or isinstance(sample, StateRejection)):
-            self._attitudes.on_attitude(sample.t_vehicle_us, frame.arrival_wall_ns)
+            if self._streams is not None:
+                self._streams.on_attitude(sample.t_vehicle_us, frame.arrival_wall_ns)
             tracker.refresh(Attitude(sample.t_vehicle_us * 1e-6, sample.q, sample.w))
 
     def _on_timesync(self, frame: Frame) -> None:

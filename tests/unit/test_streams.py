@@ -2,7 +2,7 @@
 
 import pytest
 
-from companion.flight.attitudes import STATES_JUDGED, Attitudes
+from companion.flight.streams import STATES_JUDGED, Attitudes
 
 
 def judged(attitudes: Attitudes, age_us: int, behind_ns: int, states: int = STATES_JUDGED + 10) -> list[int]:
