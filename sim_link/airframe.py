@@ -105,6 +105,8 @@ class Airframe:
                 seed,
             ),
         )
+        self.rigid = self._engine.rigid
+        """True mechanical state."""
         self._thrust_factor = 1.0
         self._rotor_shares: Vec4 = (1.0, 1.0, 1.0, 1.0)
         self._gust_m_s: Vec3 | None = None
@@ -114,7 +116,7 @@ class Airframe:
         self._engine.air_m_s = self._wind.air_m_s
         self.beliefs = Beliefs(
             self._engine,
-            lambda: self._engine.rigid,
+            lambda: self.rigid,
             lambda: self.t_us,
             vehicle=vehicle,
             seed=seed,
@@ -134,11 +136,6 @@ class Airframe:
         return at_rest(p, yaw, hover_thrusts(self.vehicle, load))
 
     @property
-    def rigid(self) -> RigidState:
-        """True mechanical state."""
-        return self._engine.rigid
-
-    @property
     def on_ground(self) -> bool:
         """Whether the vehicle touches the ground."""
         return self._engine.on_ground
@@ -156,16 +153,19 @@ class Airframe:
         engine, wind, beliefs = self._engine, self._wind, self.beliefs
         if beliefs.active:
             setpoint = beliefs.in_truth(setpoint)
+        gusty, recording = wind.gusty, beliefs.recording
         while n_steps > 0:
-            gusty = wind.gusty
-            steps = min(n_steps, self._steps_per_gust - self._gust_phase) if gusty else n_steps
-            if beliefs.recording:
+            steps = n_steps
+            if recording:
                 steps = 1
+            elif gusty:
+                steps = min(n_steps, self._steps_per_gust - self._gust_phase)
             engine.run(setpoint, fresh, steps)
+            self.rigid = engine.rigid
             fresh = False
             n_steps -= steps
             self.t_us += steps * self.dt_us
-            if beliefs.recording:
+            if recording:
                 beliefs.record()
             self._gust_phase = (self._gust_phase + steps) % self._steps_per_gust
             if gusty and self._gust_phase == 0:
@@ -179,10 +179,13 @@ class Airframe:
         """
         return self.beliefs.estimate(steps_ahead) if self.beliefs.active else self._engine.believed(steps_ahead)
 
+    def foresee(self, steps_ahead: int) -> None:
+        """Take note for how many steps ahead, at most `age_steps`, beliefs will be asked for after each `advance`."""
+        self._engine.foresee(steps_ahead)
+
     def inner_state(self) -> RigidState:
         """Return the state without delay and noise that the autopilot's own modes use: the truth, but for `beliefs`."""
-        rigid = self._engine.rigid
-        return self.beliefs.inner(rigid) if self.beliefs.active else rigid
+        return self.beliefs.inner(self.rigid) if self.beliefs.active else self.rigid
 
     def rates_followed(self) -> Vec3:
         """Return the body rates that the rate loop follows [rad/s]."""
@@ -210,10 +213,10 @@ class Airframe:
 
     def truth(self) -> Truth:
         """Return the truth now; on the ground the disturbance leaves out what the ground does."""
-        p, v, q, w, rotor_n = self._engine.rigid
-        return Truth(self.t_us, p, v, q, w, rotor_n, sum(rotor_n), self._disturbance())
+        p, v, q, w, rotor_n = self.rigid
+        return Truth(self.t_us, p, v, q, w, rotor_n, sum(rotor_n), self.disturbance())
 
-    def _disturbance(self) -> Vec3:
+    def disturbance(self) -> Vec3:
         """Return the disturbance now; the same object as long as nothing changes."""
         air, force, body = self._engine.air_m_s, self._engine.force_n, self._body
         known = self._disturbed

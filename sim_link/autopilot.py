@@ -20,7 +20,7 @@ from .land_detector import LandDetector, Motion
 from .manual_control import ManualInput
 from .missions import Plans
 from .modes import Mode
-from .offboard import Offboard, Order, PositionTarget
+from .offboard import TRAJECTORY, Offboard, Order, PositionTarget
 from .orders import Orders
 from .parameters import Parameters
 from .physics import RigidState
@@ -97,9 +97,11 @@ class Autopilot:
         """The last attitude setpoint of any source, which ATTITUDE_TARGET goes on reporting."""
         self._rigid = rigid
         self._now_us = now_us
-        self._health_us = now_us
-        self._watch_us = now_us
+        self._look_us = self._health_us = self._watch_us = now_us
+        """When something is due next, and what it is (see `_look`)."""
         self._armed_us = now_us - _LONG_AGO_US
+        self._spool_up_s = 0.0
+        self._parameters_version = -1
         self._took_off = in_air
         self._offboard_ok = False
         self._ground_us: int | None = None
@@ -321,6 +323,28 @@ class Autopilot:
         """Advance to `now_us`, where the vehicle is in state `rigid`; gives the order for the next dt_s."""
         self._now_us = now_us
         self._rigid = rigid
+        if now_us >= self._look_us:
+            self._look(now_us, rigid)
+        offboard = self.offboard
+        if (
+            self.mode is Mode.OFFBOARD
+            and now_us < offboard.look_us
+            and offboard.follows != TRAJECTORY
+            and self._orders.rests
+            and self.armed
+            and not self.terminated
+        ):
+            # Which is what `_order` comes to in nearly all states of a flight with a companion.
+            order = offboard.order(self.held)
+        else:
+            order = self._order(rigid, dt_s)
+        setpoint = self.held = order.setpoint
+        if setpoint.mode == ATTITUDE:
+            self.attitude_setpoint = setpoint
+        return order
+
+    def _look(self, now_us: int, rigid: RigidState) -> None:
+        """Do what is due now and then, and find out when something will be again."""
         if now_us >= self._health_us:
             self._health_us += HEALTH_PERIOD_US
             self._check()
@@ -330,11 +354,7 @@ class Autopilot:
         if now_us >= self._fence_us:
             self._fence_us += FENCE_PERIOD_US
             self._watch_fence(rigid.p)
-        order = self._order(rigid, dt_s)
-        setpoint = self.held = order.setpoint
-        if setpoint.mode == ATTITUDE:
-            self.attitude_setpoint = setpoint
-        return order
+        self._look_us = min(self._health_us, self._watch_us, self._fence_us)
 
     def observe(self, now_us: int, rigid: RigidState) -> None:
         """Take note of the time and the state at which the next requests come in."""
@@ -429,7 +449,11 @@ class Autopilot:
         blind = self._blind_us is not None and self._orders.needs_estimate(self.mode)
         if blind and self.held is not STOPPED_SETPOINT:
             return Order(self.held, False)  # the position controller runs with estimates only
-        spooled_up = (self._now_us - self._armed_us) * 1e-6 >= self.parameters.number("COM_SPOOLUP_TIME")
+        parameters = self.parameters
+        if parameters.version != self._parameters_version:
+            self._parameters_version = parameters.version
+            self._spool_up_s = parameters.number("COM_SPOOLUP_TIME")
+        spooled_up = (self._now_us - self._armed_us) * 1e-6 >= self._spool_up_s
         return self._orders.give(self.mode, self._now_us, rigid, dt_s, self.held, spooled_up)
 
     # Failsafe and arming

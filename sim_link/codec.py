@@ -31,7 +31,9 @@ __all__ = [
     "Frame",
     "actuator_controls",
     "attitude_target",
+    "exchange",
     "frames",
+    "lone_setpoint",
     "mavlink",
     "padded",
     "timesync",
@@ -47,7 +49,6 @@ SIGNATURE_LENGTH = 13
 AUTOPILOT_COMPONENT = 1
 """MAV_COMP_ID_AUTOPILOT1: what every vehicle's autopilot is."""
 _HEADER = struct.Struct("<BBBBBBBHB")
-_HEADER_AFTER_MAGIC = struct.Struct("<BBBBBBHB")
 _MAGIC_V2_BYTE = bytes((MAGIC_V2,))
 _WHOLE = 12
 """Bytes of a MAVLink 2 frame without its payload."""
@@ -75,9 +76,10 @@ ID_SETUP_SIGNING = 256
 ID_SET_ACTUATOR_CONTROL_TARGET = 139
 ID_ODOMETRY = 331
 
-ODOMETRY = struct.Struct("<Q13f168sBBBBb")
-"""time_usec, x, y, z, q, vx, vy, vz, rollspeed, pitchspeed, yawspeed; two covariances; frame_id, child_frame_id,
-reset_counter, estimator_type, quality."""
+ODOMETRY_STATE = struct.Struct("<Q13f")
+"""time_usec, x, y, z, q, vx, vy, vz, rollspeed, pitchspeed, yawspeed."""
+ODOMETRY_REST = struct.Struct("<168sBBBBb")
+"""Two covariances; frame_id, child_frame_id, reset_counter, estimator_type, quality."""
 COVARIANCE = struct.Struct("<21f")
 """Upper triangle of pose or velocity."""
 ATTITUDE_QUATERNION = struct.Struct("<I7f4f")
@@ -88,6 +90,14 @@ TIMESYNC = struct.Struct("<qqBB")
 HIL_STATE_QUATERNION = struct.Struct("<Q7fiiihhhHHhhh")
 SET_ATTITUDE_TARGET = struct.Struct("<I8fBBB3f")
 SET_ACTUATOR_CONTROL_TARGET = struct.Struct("<Q8fBBB")
+_EXCHANGE = struct.Struct("<4sBBB3s39sH4sBBB3sqqBBH")
+"""A SET_ATTITUDE_TARGET without its extension, and a TIMESYNC: two frames of MAVLink 2, checksums included."""
+_SETPOINT_BEGIN, _SETPOINT_ID = b"\xfd\x27\0\0", ID_SET_ATTITUDE_TARGET.to_bytes(3, "little")
+_ANSWER_BEGIN, _ANSWER_ID = b"\xfd\x12\0\0", ID_TIMESYNC.to_bytes(3, "little")
+"""Magic, length and flags (not signed); message id."""
+_SETPOINT_BYTES = 51
+_SETPOINT_CHECKED, _ANSWER_CHECKED = slice(1, 49), slice(52, 79)
+_SETPOINT_EXTRA, _ANSWER_EXTRA = _CHECKED[ID_SET_ATTITUDE_TARGET][0], _CHECKED[ID_TIMESYNC][0]
 
 
 class Frame(NamedTuple):
@@ -196,7 +206,46 @@ def attitude_target(payload: bytes) -> AttitudeTarget:
     _, w, x, y, z, p, q, r, thrust, system, component, mask, bx, by, bz = SET_ATTITUDE_TARGET.unpack_from(
         payload.ljust(SET_ATTITUDE_TARGET.size, b"\0")
     )
-    return AttitudeTarget(system, component, mask, (w, x, y, z), (p, q, r), thrust, (bx, by, bz))
+    # As its constructor does, without the call of it: this is done for every state.
+    return tuple.__new__(AttitudeTarget, (system, component, mask, (w, x, y, z), (p, q, r), thrust, (bx, by, bz)))
+
+
+def lone_setpoint(datagram: bytes) -> bytes | None:
+    """Read the datagram that nearly all of a companion's are in real time: gives SET_ATTITUDE_TARGET's payload.
+
+    None: it is another one, which `frames` sorts out.
+    """
+    if (
+        len(datagram) == _SETPOINT_BYTES
+        and datagram[:4] == _SETPOINT_BEGIN
+        and datagram[7:10] == _SETPOINT_ID
+        and mcrf4xx(datagram[_SETPOINT_CHECKED] + _SETPOINT_EXTRA) == datagram[-2] | datagram[-1] << 8
+    ):
+        return datagram[10:-2]
+    return None
+
+
+def exchange(datagram: bytes) -> tuple[bytes, int] | None:
+    """Read the datagram that nearly all of a companion's are in lockstep: a setpoint, then an answer to TIMESYNC.
+
+    Gives SET_ATTITUDE_TARGET's payload and TIMESYNC's ts1 [ns]. None: it is another one, which `frames` sorts out.
+    """
+    if len(datagram) != _EXCHANGE.size:
+        return None
+    begin, _, _, _, number, payload, crc, answer, _, _, _, answer_number, tc1, ts1, _, _, answer_crc = _EXCHANGE.unpack(
+        datagram
+    )
+    if (
+        begin == _SETPOINT_BEGIN
+        and number == _SETPOINT_ID
+        and answer == _ANSWER_BEGIN
+        and answer_number == _ANSWER_ID
+        and tc1 != 0
+        and mcrf4xx(datagram[_SETPOINT_CHECKED] + _SETPOINT_EXTRA) == crc
+        and mcrf4xx(datagram[_ANSWER_CHECKED] + _ANSWER_EXTRA) == answer_crc
+    ):
+        return payload, ts1
+    return None
 
 
 def actuator_controls(payload: bytes) -> ActuatorControls:
@@ -233,21 +282,22 @@ class Encoder:
         self.sequence = 0
         self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
         self._signatures = signatures
+        self._known: dict[int, tuple[bytes, bytes]] = {}
+        """Of each message that was framed: what stands between its sequence number and its payload; extra byte."""
 
     def hot(self, msg_id: int, payload: bytes) -> bytes:
         """Frame a payload packed with one of the structs above."""
-        body = payload.rstrip(b"\0") or payload[:1]
+        body = payload if payload[-1] else payload.rstrip(b"\0") or payload[:1]
         signatures = self._signatures
         signed = signatures is not None and signatures.on
+        known = self._known.get(msg_id)
+        if known is None:
+            sender = bytes((self.system, self.component)) + msg_id.to_bytes(3, "little")
+            known = self._known[msg_id] = sender, _CHECKED[msg_id][0]
         sequence = self.sequence
         self.sequence = (sequence + 1) & 0xFF
-        checked = (
-            _HEADER_AFTER_MAGIC.pack(
-                len(body), signed, 0, sequence, self.system, self.component, msg_id & 0xFFFF, msg_id >> 16
-            )
-            + body
-        )
-        frame = _MAGIC_V2_BYTE + checked + mcrf4xx(checked + _CHECKED[msg_id][0]).to_bytes(2, "little")
+        checked = bytes((len(body), signed, 0, sequence)) + known[0] + body
+        frame = _MAGIC_V2_BYTE + checked + mcrf4xx(checked + known[1]).to_bytes(2, "little")
         return frame + signatures.tail(frame) if signed and signatures is not None else frame
 
     def cold(self, message: Any) -> bytes:

@@ -76,6 +76,9 @@ class Engine(Protocol):
     def believed(self, steps_ahead: int) -> Estimate:
         """Return the estimate that is the newest in so many steps, at most its age; asking twice is free."""
 
+    def foresee(self, steps_ahead: int) -> None:
+        """Take note for how many steps ahead, at most its age, the estimate will be asked for after each `run`."""
+
 
 def make_engine(name: str, setup: Setup) -> Engine:
     """Build an engine: "python", "numba", or "auto" (numba where it can be used).
@@ -146,13 +149,18 @@ class PlainEngine:
         """Return an estimate (see Engine)."""
         return self._estimator.believed(steps_ahead)
 
+    def foresee(self, steps_ahead: int) -> None:
+        """Do nothing: an estimate takes no longer when it is asked for (see Engine)."""
+
 
 _ORDER = struct.Struct(f"{flat.ORDER_NUMBERS}d")
-_PAIR = struct.Struct("2d")
+_PAIR, _FOUR = struct.Struct("2d"), struct.Struct("4d")
 _RIGID = struct.Struct(f"{flat.RIGID_NUMBERS}d")
 _ESTIMATE = struct.Struct(f"{flat.ESTIMATE_NUMBERS}d")
 _VECTOR = struct.Struct("3d")
 _FLOAT_BYTES = 8
+_NEW = tuple.__new__
+"""Makes a named tuple of a tuple without the call of its constructor."""
 
 
 def _floats(value: Any) -> list[float]:
@@ -192,6 +200,9 @@ class CompiledEngine:
         """True mechanical state (see Engine)."""
         self._last: Estimate | None = None
         self._last_sample = -1
+        self._foresight = 0
+        self._written = -1
+        """Sample whose estimate is in the array."""
         self.gains = setup.gains
         self.air_m_s = (0.0, 0.0, 0.0)
         self.force_n = (0.0, 0.0, 0.0)
@@ -252,36 +263,47 @@ class CompiledEngine:
 
     def run(self, setpoint: Setpoint, fresh: bool, n_steps: int) -> None:
         """Run steps (see Engine)."""
+        self._sample += n_steps
+        self._row = (self._row + n_steps) % self._ring_rows
+        row, noise = self._place(self._foresight)
         if setpoint is self._set:
-            _PAIR.pack_into(self._bytes, _FLOAT_BYTES * flat.FRESH, fresh, n_steps)
+            _FOUR.pack_into(self._bytes, _FLOAT_BYTES * flat.FRESH, fresh, n_steps, row, noise)
         else:
             mode, thrust, rates, q, yaw_rate, torque = setpoint
             at = _FLOAT_BYTES * flat.ORDER
-            _ORDER.pack_into(self._bytes, at, mode, thrust, *rates, *q, yaw_rate, *torque, fresh, n_steps)
+            _ORDER.pack_into(self._bytes, at, mode, thrust, *rates, *q, yaw_rate, *torque, fresh, n_steps, row, noise)
             self._set = setpoint
         self._run(self._x)
         a, b, c, d, e, f, q0, q1, q2, q3, g, h, i, r0, r1, r2, r3 = _RIGID.unpack_from(self._bytes, 0)
-        self.rigid = RigidState((a, b, c), (d, e, f), (q0, q1, q2, q3), (g, h, i), (r0, r1, r2, r3))
-        self._sample += n_steps
-        self._row = (self._row + n_steps) % self._ring_rows
+        self.rigid = _NEW(RigidState, ((a, b, c), (d, e, f), (q0, q1, q2, q3), (g, h, i), (r0, r1, r2, r3)))
+
+    def _place(self, steps_ahead: int) -> tuple[int, int]:
+        """Give the rows of the ring and of the noise that make an estimate, which is to be written."""
+        self._written = sample = self._sample + steps_ahead
+        blocks = self._blocks
+        if not 0 <= sample - blocks.first < len(blocks.rows):
+            blocks.move_to(sample)
+            self._x[flat.NOISE : flat.RING] = blocks.rows.reshape(-1)
+        return (self._row + steps_ahead) % self._ring_rows, sample - blocks.first
+
+    def foresee(self, steps_ahead: int) -> None:
+        """Let `run` write that estimate as well (see Engine)."""
+        self._foresight = steps_ahead
 
     def set_noise_factor(self, factor: float) -> None:
         """Scale the noise (see Engine)."""
         self._put(flat.SIGMAS, noise_of(self._vehicle, factor))
-        self._last = None
+        self._last, self._written = None, -1
 
     def believed(self, steps_ahead: int) -> Estimate:
         """Return an estimate (see Engine)."""
         sample = self._sample + steps_ahead
         if self._last is None or self._last_sample != sample:
-            blocks = self._blocks
-            if blocks.move_to(sample):
-                self._x[flat.NOISE : flat.RING] = blocks.rows.reshape(-1)
-            row = (self._row + steps_ahead) % self._ring_rows
-            _PAIR.pack_into(self._bytes, _FLOAT_BYTES * flat.ASK, row, sample - blocks.first)
-            self._estimate(self._x)
+            if self._written != sample:
+                _PAIR.pack_into(self._bytes, _FLOAT_BYTES * flat.ASK, *self._place(steps_ahead))
+                self._estimate(self._x)
             a, b, c, d, e, f, q0, q1, q2, q3, g, h, i = _ESTIMATE.unpack_from(self._bytes, _FLOAT_BYTES * flat.ESTIMATE)
             t_us = sample * self._dt_us + self._offset_us
-            self._last = Estimate(t_us, (a, b, c), (d, e, f), (q0, q1, q2, q3), (g, h, i))
+            self._last = _NEW(Estimate, (t_us, (a, b, c), (d, e, f), (q0, q1, q2, q3), (g, h, i)))
             self._last_sample = sample
         return self._last

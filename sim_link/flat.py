@@ -21,14 +21,13 @@ RIGID_NUMBERS = 17
 LOOPS = 17
 LOOPS_NUMBERS = 17
 ORDER = 34
-"""Setpoint, then whether it is fresh (0 or 1) and the number of steps."""
+"""Setpoint, then whether it is fresh (0 or 1), the number of steps, and what is asked for."""
 FRESH = 47
-ORDER_NUMBERS = 15
-TOUCH = 49
-"""On the ground after the last step (0 or 1), then the hardest touchdown so far [m/s]."""
-ASK = 51
+ASK = 49
 """Row of the ring, and row of the noise, that make the estimate that is asked for."""
-ASK_NUMBERS = 2
+ORDER_NUMBERS = 17
+TOUCH = 51
+"""On the ground after the last step (0 or 1), then the hardest touchdown so far [m/s]."""
 ESTIMATE = 53
 """p, v, q, w of the estimate that was asked for."""
 ESTIMATE_NUMBERS = 13
@@ -56,7 +55,7 @@ def length(ring_rows: int) -> int:
 
 
 def run_steps(x: MutableSequence[float]) -> None:
-    """Run the steps that the array asks for, and keep the true states of all of them."""
+    """Run the steps that the array asks for, keep the true states of all of them, and write the estimate of then."""
     rigid = RigidState((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8], x[9]), (x[10], x[11], x[12]),
                        (x[13], x[14], x[15], x[16]))  # fmt: skip
     loops = LoopState((x[17], x[18], x[19]), (x[20], x[21], x[22]), (x[23], x[24], x[25]),
@@ -95,6 +94,7 @@ def run_steps(x: MutableSequence[float]) -> None:
         x[30 + i] = loops.w_ref[i]
     x[26], x[27], x[28], x[29] = loops.q_ref
     x[33] = loops.reference_age_s
+    estimate(x)
 
 
 def keep(x: MutableSequence[float], at: int, rigid: RigidState) -> None:

@@ -67,6 +67,7 @@ class Member(Peer):
         self.companion.together = True  # fewer datagrams: they are most of what a vehicle costs besides its physics
         end_s = math.inf if duration_s is None else duration_s
         self._end_us = self.vehicle.start_us + end_s * 1e6
+        self._last_us = None if duration_s is None else self.vehicle.start_us + round(duration_s * 1e6)
         for intake in self._intakes:
             intake.listen()
 

@@ -225,7 +225,7 @@ class Hil:
         link.send(world.sample())
         self.samples += 1
         if self._log is not None:
-            self._log.write(world.airframe.truth())
+            self._log.add(self._log.row(world.airframe))
         if not self.synchronous:
             self._run_free(link)
         if self.synchronous:

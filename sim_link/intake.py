@@ -8,6 +8,7 @@ receiver that is asked too much.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 from .codec import Frame
 from .datagram_faults import LinkFaults
@@ -23,6 +24,11 @@ ALLOWANCE_LEAST = 8
 def allowance(state_period_s: float, sharers: int = 1) -> int:
     """Give the allowance of one state; state_period_s: wall time between two, sharers: vehicles on the same core."""
     return max(ALLOWANCE_LEAST, round(ALLOWANCE_PER_S * state_period_s / sharers))
+
+
+def _other(datagram: bytes) -> bool:
+    """Obey nothing."""
+    return False
 
 
 class Intake:
@@ -56,27 +62,33 @@ class Intake:
     def refill(self) -> None:
         """Begin a new state."""
         self.left = self._per_state
-        self.listen()
+        if not self._listens:
+            self.listen()
 
     def rest(self) -> None:
         """Ignore the socket until the next state, if the allowance is used up."""
         if self.left <= 0:
             self.ignore()
 
-    def next(self, faults: LinkFaults | None) -> tuple[Frame, Address] | None:
+    def next(self, faults: LinkFaults | None, obeyed: Callable[[bytes], bool] = _other) -> tuple[Frame, Address] | None:
         """Give the next message and its sender; None when nothing is there, or the allowance is used up. Never blocks.
 
-        `faults`: what happens to datagrams on their way in.
+        Args:
+            faults: what happens to datagrams on their way in.
+            obeyed: is shown a datagram as it came, and may act on the one message in it itself: then it says so.
         """
         pending, left = self._pending, self.left
         while not pending:
             if left <= 0:
                 return None
-            datagram = self._endpoint.receive()
-            if datagram is None:
+            taken = self._endpoint.take()
+            if taken is None:
                 return None
             left = self.left = left - 1
-            found, self._sender = datagram
+            if left > 0 and obeyed(taken[0]):
+                left = self.left = left - 1
+                continue
+            found, self._sender = self._endpoint.read(*taken)
             pending.extend(found if faults is None else faults.incoming(found))
         if left <= 0:
             return None

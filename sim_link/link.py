@@ -53,10 +53,11 @@ class Link:
         """What happens to the datagrams on their way, while anything does: whoever owns the socket asks it."""
         self.quiet = quiet
         """Sends its heartbeat only, until somebody has spoken on it."""
-        self._next_us = 0
+        self.next_us = 0
         """Vehicle time before which nothing but the messages of every state is due."""
         self._period_us = 0
-        self._every_state: list[int] = []
+        self.every_state: list[int] = []
+        """Messages of every state: all that there is to `due` before `next_us`."""
         self._now_and_then: list[tuple[int, Stream]] = []
         self.streams: dict[int, Stream] = {}
         for number, rate in rates_hz.items():
@@ -82,7 +83,7 @@ class Link:
         if msg_id != ID_HEARTBEAT:
             stream.interval_us = stream.default_us if interval_us == 0 else min(max(interval_us, 0), _INT32_MAX)
             stream.due_us = now_us
-            self._next_us = 0
+            self.next_us = 0
         return True
 
     def interval_us(self, msg_id: int) -> int | None:
@@ -97,11 +98,11 @@ class Link:
 
         An interval of at most that period gives every state. A longer one keeps its rate on average, whatever the grid.
         """
-        if now_us < self._next_us:
-            return self._every_state
-        if self._next_us == 0 or period_us != self._period_us:
+        if now_us < self.next_us:
+            return self.every_state
+        if self.next_us == 0 or period_us != self._period_us:
             self._sort(period_us)
-        ids = self._every_state.copy()
+        ids = self.every_state.copy()
         next_us = now_us + _INT32_MAX
         for msg_id, stream in self._now_and_then:
             due_us = stream.due_us
@@ -113,22 +114,18 @@ class Link:
                 stream.due_us = due_us
             if due_us < next_us:  # noqa: PLR1730 (not `min`: this is done for every stream of every state)
                 next_us = due_us
-        self._next_us = next_us
+        self.next_us = next_us
         return ids
-
-    def due_without_fail(self, now_us: int, period_us: int) -> Sequence[int] | None:
-        """Give the messages to send then if those are the ones of every state; None where others may be due too."""
-        return self._every_state if now_us < self._next_us and period_us == self._period_us else None
 
     def _sort(self, period_us: int) -> None:
         """Tell the messages of every state from those that are due now and then."""
         self._period_us = period_us
         sent = [(i, s) for i, s in self.streams.items() if s.interval_us and (i == ID_HEARTBEAT or not self.quiet)]
-        self._every_state = [msg_id for msg_id, stream in sent if stream.interval_us <= period_us]
+        self.every_state = [msg_id for msg_id, stream in sent if stream.interval_us <= period_us]
         self._now_and_then = [(msg_id, stream) for msg_id, stream in sent if stream.interval_us > period_us]
 
     def speak(self) -> None:
         """End the silence of a quiet link: somebody is there."""
         if self.quiet:
             self.quiet = False
-            self._next_us = 0
+            self.next_us = 0

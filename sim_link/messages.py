@@ -43,6 +43,9 @@ CAPABILITY_SET_ACTUATOR_TARGET = 1024
 """The bit that said that message 139 is obeyed; today's dialect calls it reserved."""
 _VERSIONS = {"1.18": (1, 18, 0), "1.13": (1, 13, 3)}
 _ATTITUDE = mavlink.MAVLink_attitude_message.unpacker
+_EXTENDED_SYS_STATE = mavlink.MAVLink_extended_sys_state_message.unpacker
+_ESTIMATOR_STATUS = mavlink.MAVLink_estimator_status_message.unpacker
+_CURRENT_MODE = mavlink.MAVLink_current_mode_message.unpacker
 _TEXT_LENGTH = 50
 _HEADING_UNKNOWN = 65535
 _RELEASE = 255
@@ -72,6 +75,9 @@ class Telemetry:
         self._t_us = now.t_us
         self._rates = rates
         self._covariances = self._pack_covariances(vehicle)
+        self._odometry_rest = b""
+        self._odometry_reset = -1
+        """What ends an ODOMETRY message, and the reset counter in it."""
         self.reset_counter = 0
         """Of the estimator: any change tells receivers to start their filters anew."""
         self.stamp_shift_us = 0
@@ -98,13 +104,15 @@ class Telemetry:
         self._estimate = estimate
 
     def build_ahead(self, t_us: int, estimate: Estimate, ids: Iterable[int]) -> list[tuple[int, Payload | None]]:
-        """Build messages of another time, but for TIMESYNC; what is told of the present stays as it is."""
+        """Build those messages of another time that there are; what is told of the present stays as it is."""
         now_us, now = self._t_us, self._estimate
         self._t_us, self._estimate = t_us, estimate
-        try:
-            return [(msg_id, self.build(msg_id)) for msg_id in ids if msg_id != codec.ID_TIMESYNC]
-        finally:
-            self._t_us, self._estimate = now_us, now
+        built, builders = [], self.builders
+        for msg_id in ids:
+            if msg_id in builders:
+                built.append((msg_id, builders[msg_id]()))
+        self._t_us, self._estimate = now_us, now
+        return built
 
     @property
     def sample_us(self) -> int:
@@ -145,10 +153,13 @@ class Telemetry:
         """
         if not self._autopilot.has_estimate:
             return None
+        if self._odometry_reset != self.reset_counter:
+            self._odometry_reset = self.reset_counter
+            self._odometry_rest = codec.ODOMETRY_REST.pack(
+                self._covariances, _LOCAL_NED, _LOCAL_NED, self.reset_counter, _ESTIMATOR_AUTOPILOT, 0
+            )
         t_us, p, v, q, w = self._estimate
-        return codec.ODOMETRY.pack(
-            t_us, *p, *q, *v, *w, self._covariances, _LOCAL_NED, _LOCAL_NED, self.reset_counter, _ESTIMATOR_AUTOPILOT, 0
-        )
+        return codec.ODOMETRY_STATE.pack(t_us, *p, *q, *v, *w) + self._odometry_rest
 
     def attitude_quaternion(self) -> bytes | None:
         """ATTITUDE_QUATERNION, stamped with the sample's time."""
@@ -227,7 +238,7 @@ class Telemetry:
             return int(mavlink.MAV_STATE_ACTIVE)
         return int(mavlink.MAV_STATE_STANDBY)
 
-    def extended_sys_state(self) -> Any:
+    def extended_sys_state(self) -> bytes:
         """EXTENDED_SYS_STATE: landed state."""
         autopilot = self._autopilot
         state = mavlink.MAV_LANDED_STATE_IN_AIR
@@ -237,12 +248,12 @@ class Telemetry:
             state = mavlink.MAV_LANDED_STATE_LANDING
         elif autopilot.mode is Mode.TAKEOFF:
             state = mavlink.MAV_LANDED_STATE_TAKEOFF
-        return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
+        return bytes(_EXTENDED_SYS_STATE.pack(mavlink.MAV_VTOL_STATE_UNDEFINED, state))
 
-    def estimator_status(self) -> Any:
+    def estimator_status(self) -> bytes:
         """ESTIMATOR_STATUS: all that offboard control needs is valid; nothing is while there is no estimate."""
         flags = _ESTIMATOR_FLAGS if self._autopilot.has_estimate else 0
-        return mavlink.MAVLink_estimator_status_message(self._t_us, flags, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.1)
+        return bytes(_ESTIMATOR_STATUS.pack(self._t_us, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.1, flags))
 
     def home_position(self) -> Any:
         """HOME_POSITION."""
@@ -260,12 +271,11 @@ class Telemetry:
             self._t_us,
         )
 
-    def current_mode(self) -> Any:
+    def current_mode(self) -> bytes:
         """CURRENT_MODE: what is flown, and what was asked for."""
         autopilot = self._autopilot
-        return mavlink.MAVLink_current_mode_message(
-            autopilot.mode.standard, autopilot.mode.custom_mode, autopilot.intended.custom_mode
-        )
+        mode, intended = autopilot.mode, autopilot.intended
+        return bytes(_CURRENT_MODE.pack(mode.custom_mode, intended.custom_mode, mode.standard))
 
     def autopilot_version(self) -> Any:
         """AUTOPILOT_VERSION: the version tells whether message 139 is obeyed, and so does the capability of old."""

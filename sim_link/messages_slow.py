@@ -232,7 +232,7 @@ class SlowTelemetry:
 
     # Battery and outputs
 
-    def sys_status(self) -> Any:
+    def sys_status(self) -> bytes:
         """SYS_STATUS: the sensors are well; PREARM_CHECK says whether arming would be allowed."""
         autopilot, battery = self._autopilot, self.battery
         present = SENSORS | _FENCE | (_STICKS if autopilot.sticks_ok else 0)
@@ -245,9 +245,9 @@ class SlowTelemetry:
             health &= ~mavlink.MAV_SYS_STATUS_AHRS
         if battery.charge_state > CHARGE_LOW:
             health &= ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
-        return mavlink.MAVLink_sys_status_message(
-            present, present, health, 100, _whole(1000.0 * battery.voltage_v, 0, _UINT16_MAX - 1),
-            _whole(100.0 * battery.current_a, 0, 32767), round(100.0 * battery.remaining), 0, 0, 0, 0, 0, 0, 0, 0, 0,
+        return _pack(
+            "SYS_STATUS", present, present, health, 100, _whole(1000.0 * battery.voltage_v, 0, _UINT16_MAX - 1),
+            _whole(100.0 * battery.current_a, 0, 32767), *(0,) * 6, round(100.0 * battery.remaining), 0, 0, 0,
         )  # fmt: skip
 
     def battery_status(self) -> Any:
@@ -313,7 +313,7 @@ class SlowTelemetry:
             target.yaw, target.yaw_rate, 0, _GLOBAL_INT,
         )  # fmt: skip
 
-    def nav_controller(self) -> Any | None:
+    def nav_controller(self) -> bytes | None:
         """NAV_CONTROLLER_OUTPUT: attitude setpoint, and bearing and distance to where it flies."""
         autopilot, e = self._autopilot, self._estimate
         target = autopilot.position_setpoint
@@ -324,9 +324,8 @@ class SlowTelemetry:
         bearing = _whole(math.degrees(math.atan2(east, north)), -180, 180)
         distance = _whole(math.hypot(north, east), 0, _UINT16_MAX)
         below = _or_zero(e.p[2] - target.p[2])
-        return mavlink.MAVLink_nav_controller_output_message(
-            roll, pitch, _whole(yaw, -180, 180), bearing, distance, below, 0.0, 0.0
-        )
+        heading = _whole(yaw, -180, 180)
+        return _pack("NAV_CONTROLLER_OUTPUT", roll, pitch, below, 0.0, 0.0, heading, bearing, distance)
 
 
 def _pack(name: str, *fields: float) -> bytes:

@@ -62,6 +62,8 @@ class MissionProtocol:
         self._system = system
         self._select = select
         self._transfers: list[_Transfer] = []
+        self.is_busy = False
+        """Whether a transfer may be under way, so that `update` has something to do."""
         self.current: Callable[[], int] = lambda: 0
         """Gives the mission's current item."""
         self._handlers: dict[int, Callable[[_Transfer, Any, tuple[int, int], int], None]] = {
@@ -91,6 +93,7 @@ class MissionProtocol:
         if transfer is None:
             transfer = _Transfer(link)
             self._transfers.append(transfer)
+        self.is_busy = True
         self._handlers[frame.msg_id](transfer, message, (frame.system, frame.component), now_us)
 
     def update(self, now_us: int) -> None:
@@ -104,6 +107,7 @@ class MissionProtocol:
                 transfer.state = _State.IDLE
             elif transfer.state is _State.RECEIVING and now_us - transfer.sent_us > RETRY_US:
                 self._ask(transfer, now_us)
+        self.is_busy = any(transfer.state is not idle for transfer in self._transfers)
 
     # Upload
 

@@ -85,10 +85,20 @@ class Offboard:
         self.accepted = 0
         self.dropped = 0
         self._wants = STOPPED
-        self._follows = STOPPED
+        self.follows = STOPPED
+        """Mode of the setpoints of the controller in charge, or TRAJECTORY."""
+        self.look_us = 0
+        """Vehicle time from which on `choose` has something to do."""
         self._evaluated_us = 0
         self._delay_us = delay_us
-        self._under_way: deque[tuple[int, Setpoint | PositionSetpoint]] = deque()
+        self.under_way: deque[tuple[int, Setpoint | PositionSetpoint]] = deque()
+        """Delayed setpoints, and the vehicle times at which they reach the loops."""
+        self._parameters_version = -1
+        self._targets: frozenset[tuple[int, int]] = frozenset()
+        """Systems and components whose setpoints are taken."""
+        self._takes_scalar_thrust = False
+        self._is_plain = False
+        """Whether a scalar thrust is the thrust, whatever it is."""
         self._attitude: Setpoint | None = None
         self._rates: Setpoint | None = None
         self._torque: Setpoint | None = None
@@ -109,12 +119,12 @@ class Offboard:
     @property
     def controls_attitude(self) -> bool:
         """Whether the attitude controller runs: PX4's failure detector looks at the tilt only then."""
-        return self._follows in (ATTITUDE, TRAJECTORY)
+        return self.follows in (ATTITUDE, TRAJECTORY)
 
     @property
     def follows_trajectory(self) -> bool:
         """Whether the position controller is in charge."""
-        return self._follows == TRAJECTORY
+        return self.follows == TRAJECTORY
 
     def take_attitude_target(self, message: AttitudeTarget, now_us: int, active: bool) -> bool:
         """Take a SET_ATTITUDE_TARGET; `active`: the vehicle is in OFFBOARD. Returns whether it was accepted.
@@ -137,14 +147,20 @@ class Offboard:
         self.seen_us = now_us
         self._wants = ATTITUDE if attitude else RATES
         if active:
-            thrust = self._thrust(message)
+            thrust = message.thrust
+            if not self._is_plain or mask & (THRUST_BODY_SET | THROTTLE_IGNORE):
+                thrust = self._thrust(message)
             if attitude:
                 yaw_rate = math.nan if mask & YAW_RATE_IGNORE else message.rates[2]
                 self._publish(Setpoint(ATTITUDE, thrust, _NO_RATES, message.q, yaw_rate, _NO_RATES), now_us)
             if rates:
                 p, q, r = message.rates
                 body_rates = (p, q, math.nan if mask & YAW_RATE_IGNORE else r)
-                self._publish(Setpoint(RATES, thrust, body_rates, _LEVEL, math.nan, _NO_RATES), now_us)
+                setpoint: Setpoint = tuple.__new__(Setpoint, (RATES, thrust, body_rates, _LEVEL, math.nan, _NO_RATES))
+                if self._delay_us > 0:
+                    self._publish(setpoint, now_us)
+                else:
+                    self._rates, self._rates_fresh = setpoint, True
         return True
 
     def take_actuator_controls(self, message: ActuatorControls, now_us: int, active: bool) -> bool:
@@ -259,7 +275,7 @@ class Offboard:
 
     def enter(self, now_us: int) -> None:
         """Start following: the vehicle has changed to OFFBOARD. What was held from earlier is not used again."""
-        self._under_way.clear()
+        self.under_way.clear()
         self._attitude = self._rates = self._torque = None
         self._trajectory = self._flyable = None
         self._attitude_fresh = self._rates_fresh = self._torque_fresh = False
@@ -267,20 +283,28 @@ class Offboard:
 
     def evaluate(self, now_us: int) -> None:
         """Choose the controller from the last message's type, as PX4 does at 2 Hz and at any change of its status."""
-        self._follows = self._wants
+        self.follows = self._wants
         self._evaluated_us = now_us
+        self._set_look()
+
+    def _set_look(self) -> None:
+        """Set the time of the next look at what is under way, or at who is in charge."""
+        self.look_us = self._evaluated_us + _REEVALUATION_US
+        if self.under_way:
+            self.look_us = min(self.look_us, self.under_way[0][0])
 
     def _deliver(self, now_us: int) -> None:
         """Let the delayed setpoints arrive whose time has come."""
-        while self._under_way and self._under_way[0][0] <= now_us:
-            self._arrive(self._under_way.popleft()[1])
+        while self.under_way and self.under_way[0][0] <= now_us:
+            self._arrive(self.under_way.popleft()[1])
 
     def choose(self, now_us: int) -> None:
-        """Look at 2 Hz whether another controller shall be in charge."""
-        if self._under_way:
-            self._deliver(now_us)
+        """Look at 2 Hz whether another controller shall be in charge; before `look_us` there is nothing to do."""
+        self._deliver(now_us)
         if now_us - self._evaluated_us >= _REEVALUATION_US:
             self.evaluate(now_us)
+        else:
+            self._set_look()
 
     def order(self, held: Setpoint) -> Order:
         """Give the setpoint for the next tick, for which it is chosen (`choose`) who is in charge.
@@ -293,26 +317,22 @@ class Offboard:
         """
         glimpse: Setpoint | None = None
         setpoint, fresh = self._rates, self._rates_fresh
-        if self._follows == ATTITUDE:
+        if self.follows == ATTITUDE:
             setpoint, fresh = self._attitude, self._attitude_fresh
             glimpse = self._rates if self._rates_fresh else None
-        elif self._follows == TORQUE:
+        elif self.follows == TORQUE:
             setpoint, fresh = self._torque, self._torque_fresh
         self._attitude_fresh = self._rates_fresh = self._torque_fresh = False
         if setpoint is None:
             return Order(held, False, glimpse)
         return Order(setpoint, fresh, glimpse)
 
-    @property
-    def next_us(self) -> int | None:
-        """Vehicle time at which the next delayed setpoint reaches the loops."""
-        return self._under_way[0][0] if self._under_way else None
-
     def _publish(self, setpoint: Setpoint | PositionSetpoint, now_us: int) -> None:
         """Send a setpoint on its way to the loops."""
         if self._delay_us > 0:
             self._deliver(now_us)  # nobody asks for them while the rotors stand still, and they must not pile up
-            self._under_way.append((now_us + self._delay_us, setpoint))
+            self.under_way.append((now_us + self._delay_us, setpoint))
+            self._set_look()
         else:
             self._arrive(setpoint)
 
@@ -320,20 +340,27 @@ class Offboard:
         """Put a setpoint on its topic."""
         if isinstance(setpoint, PositionSetpoint):
             self._trajectory = setpoint
-        elif setpoint.mode == ATTITUDE:
-            self._attitude, self._attitude_fresh = setpoint, True
         elif setpoint.mode == RATES:
             self._rates, self._rates_fresh = setpoint, True
+        elif setpoint.mode == ATTITUDE:
+            self._attitude, self._attitude_fresh = setpoint, True
         else:
             self._torque, self._torque_fresh = setpoint, True
 
     def _is_for_us(self, system: int, component: int) -> bool:
         """Check the target as the receiver does; MAV_FWDEXTSP = 0 shuts external setpoints off altogether."""
-        return (
-            system in (0, self._system)
-            and component in (0, AUTOPILOT_COMPONENT)
-            and self._parameters.integer("MAV_FWDEXTSP") == 1
-        )
+        if self._parameters.version != self._parameters_version:
+            self._obey_parameters()
+        return (system, component) in self._targets
+
+    def _obey_parameters(self) -> None:
+        """Take over what the parameters say."""
+        parameters = self._parameters
+        self._parameters_version = parameters.version
+        ours = ((system, component) for system in (0, self._system) for component in (0, AUTOPILOT_COMPONENT))
+        self._targets = frozenset(ours if parameters.integer("MAV_FWDEXTSP") == 1 else ())
+        self._takes_scalar_thrust = parameters.integer("MAV_TYPE") in _SCALAR_THRUST_TYPES
+        self._is_plain = self._takes_scalar_thrust and not self._legacy
 
     def _thrust(self, message: AttitudeTarget) -> float:
         """Give the collective thrust; NaN goes through in 1.18, where it stops the rotors; in 1.13 it is no thrust."""
@@ -341,7 +368,7 @@ class Offboard:
             thrust = -message.thrust_body[2]
         elif message.type_mask & THROTTLE_IGNORE:
             thrust = 0.0
-        elif self._parameters.integer("MAV_TYPE") in _SCALAR_THRUST_TYPES:
+        elif self._takes_scalar_thrust:
             thrust = message.thrust
         else:
             thrust = 0.0

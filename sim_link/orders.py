@@ -10,7 +10,7 @@ from .inner_loops import STOPPED_SETPOINT, Setpoint
 from .land_detector import LandDetector
 from .manual_control import ManualInput
 from .modes import Mode
-from .offboard import Offboard, Order
+from .offboard import TRAJECTORY, Offboard, Order
 from .parameters import Parameters
 from .physics import RigidState
 from .position_loop import PositionSetpoint
@@ -42,6 +42,8 @@ class Orders:
         self._sticks = sticks
         self._steering = Steering(parameters, hover)
         self._attitude_sticks = AttitudeSticks(parameters)
+        self.rests = True
+        """Whether neither of these two has anything to forget."""
 
     @property
     def target(self) -> PositionSetpoint | None:
@@ -87,8 +89,9 @@ class Orders:
         """
         if mode is Mode.OFFBOARD:
             offboard = self._offboard
-            offboard.choose(now_us)
-            if offboard.follows_trajectory:
+            if now_us >= offboard.look_us:
+                offboard.choose(now_us)
+            if offboard.follows == TRAJECTORY:
                 return self._trajectory(now_us, rigid, dt_s, held, spooled_up)
             order = offboard.order(held)
         elif mode in _RATE_OR_LEVEL:
@@ -96,18 +99,22 @@ class Orders:
         elif self._stays_on_ground(spooled_up):
             order = Order(IDLE, False)
         else:
+            self.rests = False
             self._attitude_sticks.rest()
             return Order(self._steering.guided(self._guidance, rigid, dt_s), True)
-        self._rest()
+        if not self.rests:
+            self._rest()
         return order
 
     def _rest(self) -> None:
         """Let controllers that are not in charge forget."""
+        self.rests = True
         self._steering.rest()
         self._attitude_sticks.rest()
 
     def _stick_order(self, mode: Mode, now_us: int, rigid: RigidState, dt_s: float) -> Order:
         """Give what the sticks fly without the position controller; on the ground with the throttle up only."""
+        self.rests = False
         self._steering.rest()
         sticks = self._sticks.now(now_us) or CENTRED
         if self._land.landed and sticks.throttle <= 0.0:
@@ -117,6 +124,7 @@ class Orders:
 
     def _trajectory(self, now_us: int, rigid: RigidState, dt_s: float, held: Setpoint, spooled_up: bool) -> Order:
         """Give what a companion's position, velocity or acceleration flies."""
+        self.rests = False
         self._attitude_sticks.rest()
         target = self._offboard.trajectory(now_us)
         landed = self._land.landed

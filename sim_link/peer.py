@@ -14,11 +14,20 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .codec import ID_SERIAL_CONTROL, ID_SET_ATTITUDE_TARGET, ID_TIMESYNC, TIMESYNC, Frame, timesync
+from .codec import (
+    ID_SERIAL_CONTROL,
+    ID_TIMESYNC,
+    TIMESYNC,
+    Frame,
+    attitude_target,
+    exchange,
+    lone_setpoint,
+    timesync,
+)
 from .fault_shell import FaultShell
 from .intake import Intake, allowance
 from .link import Link
-from .truth_log import TruthLog, row
+from .truth_log import TruthLog
 from .udp import Address, UdpEndpoint
 from .vehicle import Vehicle
 from .waiting import Waiter
@@ -35,8 +44,6 @@ _SPIN_NEXT_S = 3.0e-5
 """The same once something of the companion has come: the rest follows closely."""
 _SPIN_REST_MAX = 127
 """States for which it sleeps at once after polling was in vain time and again: the companion needs the processor."""
-_SETPOINT_AND_ANSWER = 2
-"""Messages of the usual answer."""
 _AT_ONCE = 64
 """Of the companion's datagrams so many are acted on in lockstep before the clock and `stopped` are looked at."""
 _LATE_MAX_S = 0.25
@@ -142,7 +149,7 @@ class Peer:
 
     def log_truth(self, log: TruthLog) -> None:
         """Write a row for now and for every state to come; `close` completes the file."""
-        log.write(self.vehicle.airframe.truth())
+        log.add(log.row(self.vehicle.airframe))
         self._truth_log = log
 
     def run(self, duration_s: float | None = None) -> None:
@@ -163,8 +170,8 @@ class Peer:
             over = self._wait_for_answer()
         else:
             self._wait_for_time()
-        if text and over:
-            self._log_row(text)
+        if self._truth_log is not None and over:
+            self._truth_log.add(text)
 
     def _advance(self) -> str:
         """Move by one state period and send; gives the state's row for the truth file, if there is one."""
@@ -177,10 +184,11 @@ class Peer:
                 if link.faults is not None:
                     for frame in link.faults.released():
                         self._obey(frame, link)
+            self._flush()
         # The companion is at work now: what else there is to do costs nobody any time.
         vehicle.look_ahead()
         self._refill()
-        return "" if self._truth_log is None else row(vehicle.airframe.truth())
+        return "" if self._truth_log is None else self._truth_log.row(vehicle.airframe)
 
     def _log_row(self, text: str) -> None:
         """Write a row of the truth file."""
@@ -250,7 +258,7 @@ class Peer:
             self._act(*self._waiting.popleft())
         give_up_s = self._ticked_s + PATIENCE_S
         self._spin_first()
-        if self._answered:
+        if self._answered and self.ground is not None:
             self._hear_ground()  # nobody has slept, and so nobody has looked there
         while not self._answered:
             left_s = give_up_s - time.monotonic()
@@ -278,14 +286,13 @@ class Peer:
 
     def _spin(self, limit_s: float) -> None:
         """Poll for the answer for a time; each datagram extends it a little, but never beyond the patience."""
-        receive, clock = self.companion.receive, time.monotonic
+        take, clock = self.companion.take, time.monotonic
         end_s = clock() + limit_s
         give_up_s = self._ticked_s + PATIENCE_S
         while not self._answered:
-            datagram = receive()
+            datagram = take()
             if datagram is not None:
-                self._hurry(*datagram)
-                self._act(*datagram)
+                self._act_on(*datagram)
                 now_s = clock()
                 end_s = min(max(end_s, now_s + _SPIN_NEXT_S), give_up_s)
             else:
@@ -293,43 +300,46 @@ class Peer:
             if now_s > end_s:
                 return
 
-    def _hurry(self, found: list[Frame], sender: Address) -> None:
-        """Where a datagram is a setpoint and the answer to the present state, send the next state before acting on it.
+    def _act_on(self, datagram: bytes, sender: Address) -> None:
+        """Act on a datagram of the companion while its answer is waited for.
 
-        The companion can go on at once then; the stream is the same as without.
+        Where it is a setpoint and the answer to the present state, the next state goes out before the setpoint is acted
+        on: the companion can go on at once then; the stream is the same as without.
         """
-        if not self.synchronous or self._waiting or len(found) != _SETPOINT_AND_ANSWER or self._is_last():
+        link, usual = self.vehicle.companion, exchange(datagram)
+        mine = usual is not None and usual[1] == self._awaited_ns and sender == self.companion.partner
+        if (
+            usual is None
+            or not mine
+            or self._waiting
+            or link.faults is not None
+            or self.vehicle.keyring.key is not None
+        ):
+            self._act(*self.companion.read(datagram, sender))
             return
-        setpoint, answer = found
-        if setpoint.msg_id != ID_SET_ATTITUDE_TARGET or answer.msg_id != ID_TIMESYNC:
-            return
-        tc1, ts1 = timesync(answer.payload)
-        if tc1 == 0 or ts1 != self._awaited_ns or sender != self.companion.partner:
-            return
-        t_us = self.vehicle.tell_ahead()
-        if t_us is not None:
-            self._ahead_ns = t_us * 1000
-            self._ticked_s = time.monotonic()
-            self.vehicle.companion.send_hot(ID_TIMESYNC, TIMESYNC.pack(0, self._ahead_ns, 0, 0))
-            self.companion.send(self.vehicle.companion.outbox)
-
-    def _is_last(self) -> bool:
-        """Whether no state comes after the present one."""
-        return self._last_us is not None and self.vehicle.airframe.t_us >= self._last_us
+        if self._last_us is None or self.vehicle.airframe.t_us < self._last_us:
+            foretold = self.vehicle.tell_ahead()
+            if foretold is not None:
+                self.companion.send(foretold.frames)
+                self._ticked_s = time.monotonic()
+                self._ahead_ns = foretold.t_us * 1000
+        self.vehicle.autopilot.attitude_target(attitude_target(usual[0]))
+        self._answered = True
 
     def _wait_for_time(self) -> None:
         """Act on what comes until the wall clock has caught up with the vehicle's."""
         self._set_deadline()
-        self._serve(0.0)
+        has_listened = False  # which it does at least once, however late it is
         while True:
+            left_s = self._deadline_s - time.monotonic()
+            if (left_s <= 0.0 and has_listened) or self._stopped():
+                return
+            self._serve(min(left_s, SLICE_S))
             self._flush()
             if self._answered:
                 self._return_to_lockstep()
                 return
-            left_s = self._deadline_s - time.monotonic()
-            if left_s <= 0.0 or self._stopped():
-                return
-            self._serve(min(left_s, SLICE_S))
+            has_listened = True
 
     def _set_deadline(self) -> None:
         """Set the time of the next state; lateness beyond a limit is let go."""
@@ -379,19 +389,32 @@ class Peer:
             return
         intake, link = self._intakes[0], self.vehicle.companion
         while not (self._answered and self.options.lockstep):
-            heard = intake.next(link.faults)
+            heard = intake.next(link.faults, self._obeyed)
             if heard is None:
                 break
             intake.left -= self._take(*heard)
         intake.rest()
 
+    def _obeyed(self, datagram: bytes) -> bool:
+        """Act on a datagram that is a setpoint of the companion and nothing else; False: it is another one.
+
+        What happens to all others happens to it as well, at a fraction of the price: there is one for every state.
+        """
+        vehicle = self.vehicle
+        if self.companion.partner is None or vehicle.companion.faults is not None or vehicle.keyring.key is not None:
+            return False
+        payload = lone_setpoint(datagram)
+        if payload is not None:
+            vehicle.autopilot.attitude_target(attitude_target(payload))
+        return payload is not None
+
     def _hear_until_answer(self) -> None:
         """Act on the companion's datagrams, but none beyond its answer: those belong to the next state."""
         for _ in range(_AT_ONCE):
-            datagram = None if self._answered else self.companion.receive()
+            datagram = None if self._answered else self.companion.take()
             if datagram is None:
                 return
-            self._act(*datagram)
+            self._act_on(*datagram)
 
     def _act(self, found: list[Frame], sender: Address) -> None:
         """Act on the messages of one datagram of the companion."""

@@ -104,7 +104,8 @@ class Services:
 
     def update(self, links: Iterable[Link], now_us: int) -> None:
         """Go on with what takes time: mission transfers, and the reports of a mission's progress."""
-        self._missions.update(now_us)
+        if self._missions.is_busy:
+            self._missions.update(now_us)
         flight = self._flight
         version = self._autopilot.plans.versions[MISSION]
         if version != self._plans_version or flight.current != self._current:

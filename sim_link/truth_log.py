@@ -6,7 +6,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from .airframe import Truth
+from .airframe import Airframe
+from .rotation import Vec3
 
 COLUMNS = (
     *("t_s", "p_n", "p_e", "p_d", "v_n", "v_e", "v_d", "q_w", "q_x", "q_y", "q_z", "w_x", "w_y", "w_z"),
@@ -15,15 +16,9 @@ COLUMNS = (
 )
 """Vehicle time (as ODOMETRY.time_usec), NED [m, m/s], body to inertial, FRD [rad/s], NED [m/s^2], rotors [N]."""
 
-_ROW = "%d.%06d" + ",%.10g" * (len(COLUMNS) - 1)
+_MOTION = "%d.%06d" + ",%.10g" * 13
+_DISTURBANCE, _ROTORS = ",%.10g" * 3, ",%.10g" * 4
 _ROWS_HELD = 500
-
-
-def row(truth: Truth) -> str:
-    """Format one row."""
-    seconds, micros = divmod(truth.t_us, 1_000_000)
-    _, p, v, q, w, rotor_n, _, disturbance = truth
-    return _ROW % (seconds, micros, *p, *v, *q, *w, *disturbance, *rotor_n)
 
 
 class TruthLog:
@@ -35,10 +30,17 @@ class TruthLog:
         self._name = path.name
         self._full = False
         self._rows: list[str] = [",".join(COLUMNS)]
+        self._disturbance: Vec3 | None = None
+        self._disturbance_text = ""
 
-    def write(self, truth: Truth) -> None:
-        """Add one row."""
-        self.add(row(truth))
+    def row(self, airframe: Airframe) -> str:
+        """Format the row of now. Half of what that takes are the digits, so that those of the same object are kept."""
+        disturbance = airframe.disturbance()
+        if disturbance is not self._disturbance:
+            self._disturbance, self._disturbance_text = disturbance, _DISTURBANCE % disturbance
+        p, v, q, w, rotor_n = airframe.rigid
+        seconds, micros = divmod(airframe.t_us, 1_000_000)
+        return _MOTION % (seconds, micros, *p, *v, *q, *w) + self._disturbance_text + _ROTORS % rotor_n
 
     def add(self, text: str) -> None:
         """Add one row that is formatted already."""

@@ -71,14 +71,22 @@ class UdpEndpoint:
                     self.unsent += 1
         outbox.clear()
 
-    def receive(self) -> tuple[list[Frame], Address] | None:
-        """Give the next datagram's messages and its sender; None when nothing is waiting. Never blocks."""
+    def take(self) -> tuple[bytes, Address] | None:
+        """Give the next datagram as it came, and its sender; None when nothing is waiting. Never blocks."""
         try:
-            datagram, sender = self.socket.recvfrom(_DATAGRAM_MAX)
+            return self.socket.recvfrom(_DATAGRAM_MAX)
         except BlockingIOError:
             return None
         except OSError:
-            return [], (LOOPBACK, 0)  # an ICMP answer to something sent: nobody is there
+            return b"", (LOOPBACK, 0)  # an ICMP answer to something sent: nobody is there
+
+    def receive(self) -> tuple[list[Frame], Address] | None:
+        """Give the next datagram's messages and its sender; None when nothing is waiting. Never blocks."""
+        taken = self.take()
+        return None if taken is None else self.read(*taken)
+
+    def read(self, datagram: bytes, sender: Address) -> tuple[list[Frame], Address]:
+        """Give the messages of a datagram that was taken, and its sender, who may be the partner from now on."""
         found = frames(datagram)
         if self.partner is None and found and found[0].msg_id != ID_SERIAL_CONTROL:
             self.partner = sender  # whoever orders faults is no partner

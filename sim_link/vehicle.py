@@ -34,7 +34,6 @@ from .messages import Telemetry, truth_payload
 from .messages_slow import SlowTelemetry
 from .missions import Plans
 from .modes import Mode
-from .offboard import Order
 from .parameter_set import DEFAULTS, READ_ONLY
 from .parameters import Parameters
 from .rotation import Vec3
@@ -132,12 +131,14 @@ class VehicleOptions:
 
 
 class Foretold(NamedTuple):
-    """A state's messages, built before it."""
+    """A state's messages, built before it, and the question for the companion's answer to it."""
 
     t_us: int
     """Its vehicle time."""
-    messages: list[tuple[int, bytes]]
-    """Ids and packed contents, for the companion link."""
+    sequence: int
+    """Number of the first of the frames: they are void once another one has gone out with it."""
+    frames: list[bytes]
+    """For the companion link."""
 
 
 class Vehicle:
@@ -179,6 +180,8 @@ class Vehicle:
         self._steps_per_control = max(1, int(_CONTROL_PERIOD_S / (self.airframe.dt_us * 1e-6)))
         self.period_us = self.steps_per_tick * self.airframe.dt_us
         """Time between two states."""
+        if self.steps_per_tick <= self.airframe.age_steps:
+            self.airframe.foresee(self.steps_per_tick)
         self.start_us = self.airframe.t_us
         self._boot_us = 0
         """Time of the physics at which the vehicle's is zero."""
@@ -275,6 +278,7 @@ class Vehicle:
 
     def receive(self, frame: Frame, link: Link) -> None:
         """Act on a message that came on a link, at the present vehicle time."""
+        self._foretold = None  # whatever it asks for may concern the next state
         self.services.handle(frame, link, self.t_us)
 
     def tick(self, queued: Callable[[int], None] = _nobody) -> None:
@@ -294,20 +298,24 @@ class Vehicle:
             self._obey_beliefs()
         telemetry, period_us, left = self.telemetry, self.period_us, self.steps_per_tick
         now_us = airframe.t_us - self._boot_us + period_us
-        due = [self.companion.due(now_us, period_us), self.ground.due(now_us, period_us)]
+        companion, ground = self.companion, self.ground
+        due: list[Sequence[int]] = [
+            companion.every_state if now_us < companion.next_us else companion.due(now_us, period_us),
+            ground.every_state if now_us < ground.next_us else ground.due(now_us, period_us),
+        ]
         told, self._told_ahead_us = self._told_ahead_us == now_us, -1
         early = left <= airframe.age_steps and self._tell_the_past(due)
         if early:
+            believed = self._dated(airframe.believed(left))
+            telemetry.update(now_us, believed)
             if not told:
-                telemetry.update(now_us, self._dated(airframe.believed(left)))
                 self._publish(due, now_us)
             queued(now_us)
         while left > 0:
-            order, steps = self._decide(left)
-            self._move(order, steps)
-            left -= steps
-        believed = self._dated(airframe.believed())
-        telemetry.update(now_us, believed)
+            left -= self._fly(left)
+        if not early:
+            believed = self._dated(airframe.believed())
+            telemetry.update(now_us, believed)
         if self.slow.update(now_us, believed, airframe.rigid):
             airframe.set_thrust_factor(self.slow.battery.thrust_factor)
         self.services.update(self.links, now_us)
@@ -325,59 +333,57 @@ class Vehicle:
             self._publish_truth(self.t_us)
 
     def look_ahead(self) -> None:
-        """Prepare the next state, as far as it is known: done while there is nothing else to do."""
+        """Prepare the next state, as far as it is known, for `tell_ahead`: done while there is nothing else to do."""
         self._foretold = None
-        if self.steps_per_tick > self.airframe.age_steps:
-            return
-        estimate = self.airframe.believed(self.steps_per_tick)
-        if not self.asks_time and self._undisturbed():
-            now_us = self.t_us + self.period_us
-            ids = self.companion.due_without_fail(now_us, self.period_us)
-            others = self.ground.due_without_fail(now_us, self.period_us)
-            if ids is not None and others is not None and not others and _OF_THE_PAST.issuperset(ids):
-                self._foretold = self._foretell(ids, estimate, now_us)
+        if not self.asks_time and self.steps_per_tick <= self.airframe.age_steps and self._undisturbed():
+            estimate = self.airframe.believed(self.steps_per_tick)
+            now_us = self.airframe.t_us - self._boot_us + self.period_us
+            companion, ground = self.companion, self.ground
+            usual = now_us < companion.next_us and now_us < ground.next_us and not ground.every_state
+            if usual and _OF_THE_PAST.issuperset(companion.every_state):
+                self._foretold = self._foretell(companion.every_state, estimate, now_us)
 
     def _undisturbed(self) -> bool:
-        """Whether nothing is about to happen to the estimate, the autopilot's program, or what it has to say."""
-        airframe = self.airframe
+        """Whether only the companion's setpoints can still change anything before the next state.
+
+        That is so while it flies the vehicle and nothing else goes on, and frames are believed as they come (not
+        signed).
+        """
+        autopilot, airframe = self.autopilot, self.airframe
         beliefs = airframe.beliefs
-        return not (
-            self.booting
-            or self.autopilot.texts
-            or airframe.t_us >= self.faults.next_us
-            or beliefs.active
-            or beliefs.version != self._beliefs_version
-        )
+        if autopilot.mode is not Mode.OFFBOARD or not (autopilot.armed and autopilot.offboard_ok):
+            return False
+        if self.booting or autopilot.texts or beliefs.active or beliefs.version != self._beliefs_version:
+            return False
+        for link in self.links:
+            if link.outbox or link.parameters_to_send or link.faults is not None:
+                return False
+        return airframe.t_us < self.faults.next_us and self.keyring.key is None
 
     def _foretell(self, ids: Sequence[int], estimate: Estimate, now_us: int) -> Foretold | None:
         """Build the messages of the next state; what is told to whoever asks before it stays as it is."""
-        packed = []
+        encoder = self.companion.encoder
+        sequence, built = encoder.sequence, []
         for msg_id, content in self.telemetry.build_ahead(now_us, self._dated(estimate), ids):
             if not isinstance(content, bytes):
+                encoder.sequence = sequence
                 return None
-            packed.append((msg_id, content))
-        return Foretold(now_us, packed)
+            built.append(encoder.hot(msg_id, content))
+        built.append(encoder.hot(ID_TIMESYNC, TIMESYNC.pack(0, now_us * 1000, 0, 0)))
+        encoder.sequence = sequence  # nothing is sent yet
+        return Foretold(now_us, sequence, built)
 
-    def tell_ahead(self) -> int | None:
-        """Queue the messages of the next state now, if nothing that may still happen before it can change them.
+    def tell_ahead(self) -> Foretold | None:
+        """Give the messages of the next state to be sent now, if nothing that may still happen can change them.
 
-        That is so while the companion flies the vehicle and nothing else goes on, and frames are believed as they come
-        (not signed): its setpoint acts on the motion, and what is told is the past. Gives the vehicle time of that
-        state, or None: it must wait for `tick`.
+        The companion's setpoint acts on the motion, and what is told is the past. None: the state must wait for `tick`.
         """
-        foretold, autopilot = self._foretold, self.autopilot
-        if foretold is None or self.keyring.key is not None or not self._undisturbed():
+        foretold, encoder = self._foretold, self.companion.encoder
+        if foretold is None or encoder.sequence != foretold.sequence or self.airframe.t_us >= self.faults.next_us:
             return None
-        if autopilot.mode is not Mode.OFFBOARD or not (autopilot.armed and autopilot.offboard_ok):
-            return None
-        for link in self.links:
-            busy = link.outbox or link.parameters_to_send or link.faults is not None
-            if busy or link.due_without_fail(foretold.t_us, self.period_us) is None:
-                return None
-        for msg_id, content in foretold.messages:
-            self.companion.send_hot(msg_id, content)
+        encoder.sequence = (foretold.sequence + len(foretold.frames)) & 0xFF
         self._told_ahead_us, self._foretold = foretold.t_us, None
-        return foretold.t_us
+        return foretold
 
     def _tell_the_past(self, due: list[Sequence[int]]) -> bool:
         """Tell whether the messages that are due hold nothing of the present motion."""
@@ -450,30 +456,30 @@ class Vehicle:
         self._truth_link.send_hot(ID_HIL_STATE_QUATERNION, payload)
         self.truth_outbox.append(self._truth_link.outbox.pop())
 
-    def _decide(self, left: int) -> tuple[Order, int]:
-        """Run the autopilot once; gives its order and for how many steps, at most `left`, it holds.
+    def _fly(self, left: int) -> int:
+        """Run the autopilot once, and the airframe with its order; gives for how many steps, at most `left`, it holds.
 
         Fewer when a delayed setpoint arrives on the way, or when the autopilot's own period ends.
         """
         airframe, autopilot = self.airframe, self.autopilot
         now_us = airframe.t_us - self._boot_us
         steps = left if left < self._steps_per_control else self._steps_per_control
-        next_us = autopilot.offboard.next_us
-        if next_us is not None and next_us > now_us:
-            steps = min(steps, -(-(next_us - now_us) // airframe.dt_us))
+        if autopilot.offboard.under_way:
+            next_us = autopilot.offboard.under_way[0][0]
+            if next_us > now_us:
+                steps = min(steps, -(-(next_us - now_us) // airframe.dt_us))
         if self.parameters.version != self._parameters_version:
             self._obey_parameters()
-        return autopilot.update(now_us, airframe.inner_state(), steps * airframe.dt_us * 1e-6), steps
-
-    def _move(self, order: Order, steps: int) -> None:
-        """Run the airframe with an order."""
-        airframe = self.airframe
-        if order.glimpse is not None:
-            airframe.advance(order.glimpse, True, 1)
-            steps -= 1
-        if steps > 0:
-            airframe.advance(order.setpoint, order.fresh, steps)
-        self.autopilot.observe(airframe.t_us - self._boot_us, airframe.inner_state())
+        beliefs = airframe.beliefs
+        here = airframe.inner_state() if beliefs.active else airframe.rigid
+        setpoint, fresh, glimpse = autopilot.update(now_us, here, steps * airframe.dt_us * 1e-6)
+        if glimpse is not None:
+            airframe.advance(glimpse, True, 1)
+        if glimpse is None or steps > 1:
+            airframe.advance(setpoint, fresh, steps if glimpse is None else steps - 1)
+        here = airframe.inner_state() if beliefs.active else airframe.rigid
+        autopilot.observe(airframe.t_us - self._boot_us, here)
+        return steps
 
     def _obey_beliefs(self) -> None:
         """Let the autopilot and the messages know what has happened to the estimate."""

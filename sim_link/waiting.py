@@ -1,4 +1,4 @@
-"""Waiting for sockets to the microsecond: a poll rounds its timeout up to milliseconds, and a state would be late."""
+"""Waiting for sockets to the microsecond: a poll's timeout are whole milliseconds, and a state would be late."""
 
 from __future__ import annotations
 
@@ -14,27 +14,26 @@ class Waiter:
 
     def __init__(self) -> None:
         self._poll = select.poll()
-        self._descriptors: set[int] = set()
+        self._descriptors: list[int] = []
         self._exact = True
 
     def register(self, descriptor: int) -> None:
         """Let this one end a wait."""
         self._poll.register(descriptor, select.POLLIN)
-        self._descriptors.add(descriptor)
+        self._descriptors.append(descriptor)
         self._exact = self._exact and descriptor < _SELECT_MAX
 
     def unregister(self, descriptor: int) -> None:
         """Let this one end no wait any more."""
         self._poll.unregister(descriptor)
-        self._descriptors.discard(descriptor)
+        self._descriptors.remove(descriptor)
 
     def wait(self, timeout_s: float) -> list[int]:
         """Wait until something is received, or for some time; gives the descriptors that have something.
 
-        It may end early with nothing, by less than a millisecond (late, where descriptors are many): who waits for a
-        time looks at the clock and waits again.
+        Where descriptors are many it may end late, by less than a millisecond.
         """
-        if 0.0 < timeout_s < 0.001 and self._exact:
+        timeout_s = max(0.0, timeout_s)
+        if self._exact:
             return select.select(self._descriptors, (), (), timeout_s)[0]
-        whole_ms = int(timeout_s * 1e3) if self._exact else math.ceil(timeout_s * 1e3)
-        return [descriptor for descriptor, _ in self._poll.poll(max(0, whole_ms))]
+        return [descriptor for descriptor, _ in self._poll.poll(math.ceil(timeout_s * 1e3))]

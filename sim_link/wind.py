@@ -164,12 +164,9 @@ class Wind:
         speed = math.sqrt(sum(c * c for c in wind_m_s))
         if turbulence > 0.0 and speed > _STILL_M_S:
             self._gusts = self._new_gusts(speed, turbulence)
-        self.air_m_s = self._sum()
-
-    @property
-    def gusty(self) -> bool:
+        self.gusty = self._gusts is not None
         """Whether the air changes from one period to the next."""
-        return self._gusts is not None
+        self.air_m_s = self._sum()
 
     def advance(self) -> None:
         """Go one period on."""

@@ -149,9 +149,9 @@ class Stand:
         self._decoder = codec.Decoder()
         self._stopping = False
         self._patches = contextlib.ExitStack()
-        self._send, self._receive = self.peer.companion.send, self.peer.companion.receive
+        self._send, self._take = self.peer.companion.send, self.peer.companion.take
         self.peer.companion.send = self._sending  # type: ignore[method-assign]
-        self.peer.companion.receive = self._receiving  # type: ignore[method-assign]
+        self.peer.companion.take = self._taking  # type: ignore[method-assign]
         self._thread = threading.Thread(target=self.peer.run, daemon=True)
 
     def __enter__(self) -> Stand:
@@ -205,13 +205,14 @@ class Stand:
             outbox[:] = [new for old in outbox for new in self.alter(self, message_id(old), old)]
         self._send(outbox)
 
-    def _receiving(self) -> Any:
-        datagram = self._receive()
-        if datagram is None:
+    def _taking(self) -> Any:
+        taken = self._take()
+        if taken is None:
             return None
-        for frame in datagram[0]:
+        found = codec.frames(taken[0])
+        for frame in found:
             self.heard.append(Heard(self.t_us, frame.msg_id, self._decoder.message(frame)))
-        return [frame for frame in datagram[0] if not self.deaf(self, frame)], datagram[1]
+        return b"".join(frame.raw for frame in found if not self.deaf(self, frame)), taken[1]
 
     # What was heard
 

@@ -19,7 +19,7 @@ def covariance(value):
 def odometry_payload(reset, quality):
     matrices = codec.COVARIANCE.pack(*covariance(4e-6)) + codec.COVARIANCE.pack(*covariance(2.5e-5))
     numbers = (ODOMETRY[0], *ODOMETRY[3:6], *ODOMETRY[6], *ODOMETRY[7:])
-    return codec.ODOMETRY.pack(*numbers, matrices, 1, 1, reset, 8, quality)
+    return codec.ODOMETRY_STATE.pack(*numbers) + codec.ODOMETRY_REST.pack(matrices, 1, 1, reset, 8, quality)
 
 
 def cases():

@@ -289,7 +289,7 @@ def test_setpoints_on_their_way_do_not_pile_up_while_nobody_flies_them() -> None
             v.autopilot.set_mode(Mode.OFFBOARD)
         v.tick()
     assert v.autopilot.mode is Mode.OFFBOARD and not v.autopilot.armed
-    assert len(v.autopilot.offboard._under_way) <= 6
+    assert len(v.autopilot.offboard.under_way) <= 6
 
 
 def test_faults_that_are_ordered_have_an_end() -> None:
@@ -342,14 +342,14 @@ def test_a_flood_is_heard_in_bounded_portions(name: str, monkeypatch: pytest.Mon
     with Lines(v) as lines:
         for endpoint in (lines.peer.companion, lines.peer.ground):
             assert endpoint is not None
-            receive = endpoint.receive
+            take_datagram = endpoint.take
 
-            def counted(receive=receive):
-                found = receive()
-                work["datagrams"] += found is not None
-                return found
+            def counted(take_datagram=take_datagram):
+                taken = take_datagram()
+                work["datagrams"] += taken is not None
+                return taken
 
-            monkeypatch.setattr(endpoint, "receive", counted)
+            monkeypatch.setattr(endpoint, "take", counted)
         take = v.receive
 
         def taken(frame, link):
@@ -439,9 +439,9 @@ def test_a_companion_that_answers_at_once_does_not_keep_the_ground_link_from_bei
         sender = endpoint.partner = lines.companion.getsockname()
 
         def answer():
-            return frames(framed(111, struct.pack("<qqBB", 1, lines.peer._awaited_ns, 0, 0))), sender
+            return framed(111, struct.pack("<qqBB", 1, lines.peer._awaited_ns, 0, 0)), sender
 
-        monkeypatch.setattr(endpoint, "receive", answer)
+        monkeypatch.setattr(endpoint, "take", answer)
         lines.peer.step()
         lines.to_ground_link(request(148))
         for _ in range(2):

@@ -14,7 +14,7 @@ from sim_link.airframe import START_US, Airframe
 from sim_link.autopilot import Autopilot, Result
 from sim_link.beliefs import STAMP_BACK_US, Beliefs
 from sim_link.bias_walk import BLOCK_KNOTS, KNOT_US, BiasWalk, WalkSigmas
-from sim_link.codec import ID_ODOMETRY, ODOMETRY, frames
+from sim_link.codec import ID_ODOMETRY, ODOMETRY_REST, ODOMETRY_STATE, frames
 from sim_link.estimator import Estimate
 from sim_link.inner_loops import ATTITUDE, Setpoint
 from sim_link.modes import Mode
@@ -513,14 +513,21 @@ def test_no_arming_without_an_estimate() -> None:
 # What is sent
 
 
+def fields(payload: bytes) -> tuple[object, ...]:
+    """Return the fields of an ODOMETRY message."""
+    size = ODOMETRY_STATE.size
+    rest = payload[size:].ljust(ODOMETRY_REST.size, b"\0")
+    return ODOMETRY_STATE.unpack(payload[:size]) + ODOMETRY_REST.unpack(rest)
+
+
 def odometry(v: Vehicle, ticks: int) -> list[list[tuple[object, ...]]]:
-    """Return the ODOMETRY messages of each tick."""
+    """Return the fields of the ODOMETRY messages of each tick."""
     out = []
     for _ in range(ticks):
         v.companion.outbox.clear()
         v.tick()
         found = [frame for raw in v.companion.outbox for frame in frames(raw) if frame.msg_id == ID_ODOMETRY]
-        out.append([ODOMETRY.unpack(frame.payload.ljust(ODOMETRY.size, b"\0")) for frame in found])
+        out.append([fields(frame.payload) for frame in found])
     return out
 
 

@@ -24,7 +24,7 @@ from sim_link.codec import (
 )
 from sim_link.modes import Mode
 from sim_link.peer import Peer, PeerOptions
-from sim_link.vehicle import Vehicle, VehicleOptions
+from sim_link.vehicle import Foretold, Vehicle, VehicleOptions
 from sim_link.vehicle_file import load
 
 IN_AIR = ((0.0, 0.0, -20.0), 0.0)
@@ -91,10 +91,10 @@ def flown(
         peer = Peer(v, PeerOptions(port=0, remote_port=companion.getsockname()[1], lockstep=True))
         tell_ahead = v.tell_ahead
 
-        def told() -> int | None:
-            t_us = tell_ahead() if hurries else None
-            ahead[0] += t_us is not None
-            return t_us
+        def told() -> Foretold | None:
+            foretold = tell_ahead() if hurries else None
+            ahead[0] += foretold is not None
+            return foretold
 
         v.tell_ahead = told  # type: ignore[method-assign]
         heard, encoder = b"", Encoder(1, 191)
