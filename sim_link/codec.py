@@ -260,12 +260,19 @@ def timesync(payload: bytes) -> tuple[int, int]:
     return tc1, ts1
 
 
+class Key(Protocol):
+    """The key of a vehicle."""
+
+    key: bytes | None
+    """None: nothing is signed."""
+
+
 class Signatures(Protocol):
     """What an encoder needs to sign."""
 
     @property
-    def on(self) -> bool:
-        """Whether messages are signed now."""
+    def keyring(self) -> Key:
+        """Holds the key that is in force."""
         ...
 
     def tail(self, frame: bytes) -> bytes:
@@ -289,7 +296,7 @@ class Encoder:
         """Frame a payload packed with one of the structs above."""
         body = payload if payload[-1] else payload.rstrip(b"\0") or payload[:1]
         signatures = self._signatures
-        signed = signatures is not None and signatures.on
+        signed = signatures is not None and signatures.keyring.key is not None
         known = self._known.get(msg_id)
         if known is None:
             sender = bytes((self.system, self.component)) + msg_id.to_bytes(3, "little")
@@ -305,7 +312,7 @@ class Encoder:
         self._mav.seq = self.sequence
         self.sequence = (self.sequence + 1) & 0xFF
         raw = bytes(message.pack(self._mav))
-        if self._signatures is None or not self._signatures.on:
+        if self._signatures is None or self._signatures.keyring.key is None:
             return raw
         body = raw[:2] + bytes((raw[2] | SIGNED_FLAG,)) + raw[3:-2]
         body += mcrf4xx(body[1:] + _CHECKED[message.get_msgId()][0]).to_bytes(2, "little")

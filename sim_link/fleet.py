@@ -1,8 +1,9 @@
 """Several vehicles in one thread: each with its own sockets and its own time, none waits for another.
 
-In real time every vehicle has a deadline for its next state, spread evenly over the period so that they do not all come
-at once. In lockstep every vehicle follows its own companion, as it would alone: the same seed gives the same flight.
-Between deadlines the thread sleeps in one wait over all sockets.
+In real time every vehicle has a deadline for its next state, spread over the period so that they do not all come at
+once: one after the other, or a few together where they are many. In lockstep every vehicle follows its own companion,
+as it would alone: the same seed gives the same flight. Between deadlines the thread sleeps in one wait over all
+sockets.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from .peer import HEARTBEAT_WALL_S, PATIENCE_S, SLICE_S, Peer, PeerOptions
 from .vehicle import Vehicle, VehicleOptions
 from .waiting import Waiter
 
+TOGETHER_S = 0.001
+"""Deadlines within this wall time are one: to wake for each of them, with caches that hold what others need, costs a
+vehicle a quarter of its time, and to come a few hundred microseconds after the first one harms nobody."""
 SPACING_M = 3.0
 """Between neighbours, eastwards."""
 SYSTEMS_MAX = 250
@@ -182,8 +186,9 @@ class Fleet:
         begin_s = clock()
         calendar: list[tuple[float, int]] = []
         for k, member in enumerate(self.members):
-            shift_s = k / len(self.members) * member.state_wall_s
-            member.begin(begin_s + shift_s, duration_s)
+            apart_s = member.state_wall_s / len(self.members)
+            together = max(1, int(TOGETHER_S / apart_s))
+            member.begin(begin_s + (k - k % together) * apart_s, duration_s)
             calendar.append((member.due_s, k))
         flying = set(self.members)
         while flying and not self._stopped():

@@ -70,12 +70,16 @@ class Intake:
         if self.left <= 0:
             self.ignore()
 
-    def next(self, faults: LinkFaults | None, obeyed: Callable[[bytes], bool] = _other) -> tuple[Frame, Address] | None:
+    def next(
+        self, faults: LinkFaults | None, obeyed: Callable[[bytes], bool] = _other, *, once: bool = False
+    ) -> tuple[Frame, Address] | None:
         """Give the next message and its sender; None when nothing is there, or the allowance is used up. Never blocks.
 
         Args:
             faults: what happens to datagrams on their way in.
             obeyed: is shown a datagram as it came, and may act on the one message in it itself: then it says so.
+            once: leave it at the first that was obeyed. Seldom is there another one, the next wait tells of it, and to
+                look in vain costs more than that.
         """
         pending, left = self._pending, self.left
         while not pending:
@@ -87,6 +91,8 @@ class Intake:
             left = self.left = left - 1
             if left > 0 and obeyed(taken[0]):
                 left = self.left = left - 1
+                if once:
+                    return None
                 continue
             found, self._sender = self._endpoint.read(*taken)
             pending.extend(found if faults is None else faults.incoming(found))

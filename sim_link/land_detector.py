@@ -63,8 +63,11 @@ class LandDetector:
             self.ground_contact = self.maybe_landed = self.landed = True
             self._since_us = [None, None, None]
             return
-        self.ground_contact = self._hold(0, self._touches(motion), self.ground_contact, now_us)
         falling = self._falls(motion, now_us)
+        if not self._touches(motion):
+            self.lift()
+            return
+        self.ground_contact = self._hold(0, True, self.ground_contact, now_us)
         maybe = (
             self.ground_contact and self._idles(motion) and math.hypot(*motion.w) < _ROTATION_MAX_RAD_S and not falling
         )
@@ -72,7 +75,7 @@ class LandDetector:
         self.landed = self._hold(2, self.maybe_landed, self.landed, now_us)
 
     def lift(self) -> None:
-        """Take note of a takeoff: what counted towards standing on the ground counts no more."""
+        """Be in the air: what counted towards standing on the ground counts no more."""
         self.ground_contact = self.maybe_landed = self.landed = False
         self._since_us = [None, None, None]
 
@@ -84,10 +87,12 @@ class LandDetector:
             self._hover = motion.hover
         if motion.hover is not None or not motion.descending:
             self._estimated = motion.hover is not None
+        if moving:
+            return False
         low = motion.thrust <= self._above_minimum(_LOW_THRUST_ESTIMATED if self._estimated else _LOW_THRUST)
         # Who controls the climb rate may hover with any thrust: only going down can end on the ground.
         arrives = not motion.climb_controlled or motion.descending or self.maybe_landed or self.landed
-        return low and arrives and not moving
+        return low and arrives
 
     def _above_minimum(self, share: float) -> float:
         """Give the thrust this share of the way from the least to the one that hovers."""

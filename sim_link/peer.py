@@ -145,6 +145,8 @@ class Peer:
         self._answered = False
         self._started = not options.lockstep
         self._deadline_s = time.monotonic()
+        self._is_late = False
+        """Whether the time of the next state was over already when the present one came."""
         self._ticked_s = self._deadline_s
 
     def log_truth(self, log: TruthLog) -> None:
@@ -345,6 +347,7 @@ class Peer:
         """Set the time of the next state; lateness beyond a limit is let go."""
         self._deadline_s += self.state_wall_s
         now_s = time.monotonic()
+        self._is_late = now_s > self._deadline_s
         if now_s - self._deadline_s > _LATE_MAX_S:
             self._deadline_s = now_s
 
@@ -389,7 +392,7 @@ class Peer:
             return
         intake, link = self._intakes[0], self.vehicle.companion
         while not (self._answered and self.options.lockstep):
-            heard = intake.next(link.faults, self._obeyed)
+            heard = intake.next(link.faults, self._obeyed, once=not self._is_late)
             if heard is None:
                 break
             intake.left -= self._take(*heard)

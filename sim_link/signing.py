@@ -69,11 +69,6 @@ class LinkSigning:
         self._time = keyring.initial
         self._version = keyring.version
 
-    @property
-    def on(self) -> bool:
-        """Whether messages are signed."""
-        return self.keyring.key is not None
-
     def tail(self, frame: bytes) -> bytes:
         """Give the 13 bytes that end a frame which has the signed flag set."""
         self._follow()

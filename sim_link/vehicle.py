@@ -137,6 +137,8 @@ class Foretold(NamedTuple):
     """Its vehicle time."""
     sequence: int
     """Number of the first of the frames: they are void once another one has gone out with it."""
+    estimate: Estimate
+    """What they tell."""
     frames: list[bytes]
     """For the companion link."""
 
@@ -196,8 +198,8 @@ class Vehicle:
         self.tells_truth = True
         """Whether anybody wants what gathers in `truth_outbox`."""
         self._foretold: Foretold | None = None
-        self._told_ahead_us = -1
-        """Vehicle time of the last state whose messages went out before its `tick`."""
+        self._told_ahead: Foretold | None = None
+        """The state whose messages went out before its `tick`."""
         self._truth_link = Link(self.system, {}, self.airframe.t_us)
         self._truth_us = self.airframe.t_us
         self._truth_v = self.airframe.rigid.v
@@ -264,7 +266,7 @@ class Vehicle:
         plans, battery, was_quiet = self.autopilot.plans, self.slow.battery, self.ground.quiet
         self.keyring.boot()
         self.booting = False
-        self._told_ahead_us, self._foretold = -1, None
+        self._told_ahead = self._foretold = None
         self._boot_us = self.airframe.t_us - passed_us
         self._start_autopilot(in_air=False, plans=plans)
         self.slow.battery = battery
@@ -303,12 +305,15 @@ class Vehicle:
             companion.every_state if now_us < companion.next_us else companion.due(now_us, period_us),
             ground.every_state if now_us < ground.next_us else ground.due(now_us, period_us),
         ]
-        told, self._told_ahead_us = self._told_ahead_us == now_us, -1
-        early = left <= airframe.age_steps and self._tell_the_past(due)
-        if early:
+        told, self._told_ahead = self._told_ahead, None
+        if told is not None and not due[1]:
+            early, believed = True, told.estimate
+            telemetry.update(now_us, believed)
+            queued(now_us)
+        elif early := left <= airframe.age_steps and self._tell_the_past(due):
             believed = self._dated(airframe.believed(left))
             telemetry.update(now_us, believed)
-            if not told:
+            if told is None:
                 self._publish(due, now_us)
             queued(now_us)
         while left > 0:
@@ -320,7 +325,7 @@ class Vehicle:
             airframe.set_thrust_factor(self.slow.battery.thrust_factor)
         self.services.update(self.links, now_us)
         if not early:
-            self._publish([[], due[1]] if told else due, now_us)
+            self._publish(due if told is None else [[], due[1]], now_us)
             queued(now_us)
         if self.tells_truth and now_us >= self._truth_us:
             self._publish_truth(now_us)
@@ -336,7 +341,7 @@ class Vehicle:
         """Prepare the next state, as far as it is known, for `tell_ahead`: done while there is nothing else to do."""
         self._foretold = None
         if not self.asks_time and self.steps_per_tick <= self.airframe.age_steps and self._undisturbed():
-            estimate = self.airframe.believed(self.steps_per_tick)
+            estimate = self._dated(self.airframe.believed(self.steps_per_tick))
             now_us = self.airframe.t_us - self._boot_us + self.period_us
             companion, ground = self.companion, self.ground
             usual = now_us < companion.next_us and now_us < ground.next_us and not ground.every_state
@@ -364,14 +369,14 @@ class Vehicle:
         """Build the messages of the next state; what is told to whoever asks before it stays as it is."""
         encoder = self.companion.encoder
         sequence, built = encoder.sequence, []
-        for msg_id, content in self.telemetry.build_ahead(now_us, self._dated(estimate), ids):
+        for msg_id, content in self.telemetry.build_ahead(now_us, estimate, ids):
             if not isinstance(content, bytes):
                 encoder.sequence = sequence
                 return None
             built.append(encoder.hot(msg_id, content))
         built.append(encoder.hot(ID_TIMESYNC, TIMESYNC.pack(0, now_us * 1000, 0, 0)))
         encoder.sequence = sequence  # nothing is sent yet
-        return Foretold(now_us, sequence, built)
+        return Foretold(now_us, sequence, estimate, built)
 
     def tell_ahead(self) -> Foretold | None:
         """Give the messages of the next state to be sent now, if nothing that may still happen can change them.
@@ -382,7 +387,7 @@ class Vehicle:
         if foretold is None or encoder.sequence != foretold.sequence or self.airframe.t_us >= self.faults.next_us:
             return None
         encoder.sequence = (foretold.sequence + len(foretold.frames)) & 0xFF
-        self._told_ahead_us, self._foretold = foretold.t_us, None
+        self._told_ahead, self._foretold = foretold, None
         return foretold
 
     def _tell_the_past(self, due: list[Sequence[int]]) -> bool:
