@@ -166,3 +166,32 @@ def test_random_bytes_never_raise():
     draw = random.Random(1)
     for _ in range(2000):
         codec.frames(bytes(draw.choices((0xFD, 0xFE, 0, 1, 9, 82, 255), k=draw.randrange(60))))
+
+
+def usual_datagrams():
+    encoder = codec.Encoder(1, 191)
+    fields = (7, 1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3, 0.5, 1, 1, 128, 0.0, 0.0, 0.0)
+    setpoint = encoder.hot(codec.ID_SET_ATTITUDE_TARGET, codec.SET_ATTITUDE_TARGET.pack(*fields))
+    return setpoint, encoder.hot(codec.ID_TIMESYNC, codec.TIMESYNC.pack(10**18, 123456789000, 1, 1))
+
+
+def test_usual_datagrams_are_read_at_once_and_as_frame_by_frame():
+    setpoint, answer = usual_datagrams()
+    payload = codec.frames(setpoint)[0].payload
+    assert codec.lone_setpoint(setpoint) == payload
+    assert codec.exchange(setpoint + answer) == (payload, codec.timesync(codec.frames(answer)[0].payload)[1])
+
+
+def test_whatever_is_not_quite_the_usual_datagram_goes_the_general_way():
+    setpoint, answer = usual_datagrams()
+    both = setpoint + answer
+    for at in range(len(both)):
+        broken = both[:at] + bytes((both[at] ^ 4,)) + both[at + 1 :]
+        assert codec.exchange(broken) is None
+        if at < len(setpoint):
+            assert codec.lone_setpoint(broken[: len(setpoint)]) is None
+    asked = codec.Encoder(1, 191).hot(codec.ID_TIMESYNC, codec.TIMESYNC.pack(0, 123456789000, 1, 1))
+    for other in (b"", setpoint, answer, answer + setpoint, both + answer, both[:-1], setpoint + asked):
+        assert codec.exchange(other) is None
+    for other in (b"", answer, both, setpoint[:-1]):
+        assert codec.lone_setpoint(other) is None

@@ -91,17 +91,20 @@ def test_the_array_has_room_for_every_field() -> None:
 def test_the_next_estimates_are_known_while_they_are_the_past(by_array: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engines, "compile_kernel", lambda function: function)
     monkeypatch.setattr(engines, "available", lambda: by_array)
-    a, b = airframe("auto"), airframe("auto")
+    a, b, foreseeing = airframe("auto"), airframe("auto"), airframe("auto")
     assert isinstance(a._engine, CompiledEngine) is by_array
     assert a.age_steps == 10
+    foreseeing.foresee(2)
     for i in range(300):
         ahead = [a.believed(steps) for steps in (10, 2, 0, 2)]
         assert ahead[1] == ahead[3]
         assert ahead[0].t_us == a.t_us
         a.advance(rates((0.3, 0.1, -0.2)), i == 0, 2)
         b.advance(rates((0.3, 0.1, -0.2)), i == 0, 2)
-        assert a.believed() == ahead[1] == b.believed()
+        foreseeing.advance(rates((0.3, 0.1, -0.2)), i == 0, 2)
+        assert a.believed() == ahead[1] == b.believed() == foreseeing.believed()
         assert a.believed() is a.believed()
+        assert a.believed(2) == foreseeing.believed(2)
 
 
 @pytest.mark.parametrize("per_call", [1, 2, 5, 20])
