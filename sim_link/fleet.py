@@ -78,13 +78,13 @@ class Member(Peer):
     @property
     def descriptors(self) -> list[int]:
         """Its sockets, as a wait tells them."""
-        return [endpoint.fileno() for endpoint in self._endpoints]
+        return [endpoint.descriptor for endpoint in self._endpoints]
 
     def hear(self, descriptor: int) -> None:
         """Act on what one of its sockets has received; in lockstep go on once the companion has answered."""
         if self.due_s == math.inf:
             return
-        if descriptor != self.companion.fileno():
+        if descriptor != self.companion.descriptor:
             self._hear_ground()
         elif self._started:
             self._hear_companion()

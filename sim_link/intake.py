@@ -51,13 +51,13 @@ class Intake:
         """Let the socket end a wait."""
         if not self._listens:
             self._listens = True
-            self._waiter.register(self._endpoint.fileno())
+            self._waiter.register(self._endpoint.descriptor)
 
     def ignore(self) -> None:
         """Let the socket end no wait."""
         if self._listens:
             self._listens = False
-            self._waiter.unregister(self._endpoint.fileno())
+            self._waiter.unregister(self._endpoint.descriptor)
 
     def refill(self) -> None:
         """Begin a new state."""

@@ -132,6 +132,8 @@ class Peer:
         self._notice = notice
         self._endpoints = [self.companion] if self.ground is None else [self.companion, self.ground]
         self._waiter = Waiter() if waiter is None else waiter
+        self.state_wall_s = vehicle.period_us * 1e-6 / (1.0 if options.lockstep else options.speed)
+        """Wall time between two states, while no companion moves the clock."""
         per_state = allowance(self.state_wall_s, sharers)
         self._intakes = [Intake(endpoint, self._waiter, per_state) for endpoint in self._endpoints]
         self._waiting: deque[tuple[list[Frame], Address]] = deque()
@@ -365,15 +367,10 @@ class Peer:
             self._waiting.append(left)
         self._notice("the companion answers again: back in lockstep")
 
-    @property
-    def state_wall_s(self) -> float:
-        """Wall time between two states, while no companion moves the clock."""
-        return self.vehicle.period_us * 1e-6 / (1.0 if self.options.lockstep else self.options.speed)
-
     def _serve(self, timeout_s: float) -> None:
         """Wait until something is received, and act on it."""
         for descriptor in self._waiter.wait(timeout_s):
-            if descriptor == self.companion.fileno():
+            if descriptor == self.companion.descriptor:
                 self._hear_companion()
             else:
                 self._hear_ground()

@@ -48,16 +48,14 @@ class UdpEndpoint:
             why = "is in use" if in_use else f"cannot be used ({error})"
             raise PortError(f"UDP port {port} on {LOOPBACK} {why}; choose another with {option}") from None
         self.port: int = self.socket.getsockname()[1]
+        self.descriptor = self.socket.fileno()
+        """As a wait tells it."""
         self.partner: Address | None = None
         self._remote: Address | None = (LOOPBACK, remote_port) if remote_port else None
         self.together = False
         """Put several frames into one datagram, as far as a network takes it whole."""
         self.unsent = 0
         """Datagrams that the system did not take."""
-
-    def fileno(self) -> int:
-        """Let `select` use the endpoint itself."""
-        return self.socket.fileno()
 
     def send(self, outbox: list[bytes]) -> None:
         """Send every frame as one datagram, and empty the list. What the system does not take is lost, as by radio."""
