@@ -110,8 +110,8 @@ class Airframe:
         self._thrust_factor = 1.0
         self._rotor_shares: Vec4 = (1.0, 1.0, 1.0, 1.0)
         self._gust_m_s: Vec3 | None = None
-        self._disturbed: tuple[Vec3, Vec3, Vec3] | None = None
-        """Air, force, and the disturbance that they make."""
+        self._disturbance: Vec3 | None = None
+        """What air and force come to; None: one of them has changed since."""
         self._engine.force_n = world.force_n
         self._engine.air_m_s = self._wind.air_m_s
         self.beliefs = Beliefs(
@@ -170,7 +170,7 @@ class Airframe:
             self._gust_phase = (self._gust_phase + steps) % self._steps_per_gust
             if gusty and self._gust_phase == 0:
                 wind.advance()
-                engine.air_m_s = wind.air_m_s if self._gust_m_s is None else self._air()
+                self._blow()
 
     def believed(self, steps_ahead: int = 0) -> Estimate:
         """Return what the vehicle believes: late and noisy, stamped with the sample's time.
@@ -218,31 +218,33 @@ class Airframe:
 
     def disturbance(self) -> Vec3:
         """Return the disturbance now; the same object as long as nothing changes."""
-        air, force, body = self._engine.air_m_s, self._engine.force_n, self._body
-        known = self._disturbed
-        if known is None or air is not known[0] or force is not known[1]:
-            disturbance = (
+        known = self._disturbance
+        if known is None:
+            air, force, body = self._engine.air_m_s, self._engine.force_n, self._body
+            known = self._disturbance = (
                 body.drag_1_s * air[0] + force[0] / body.mass_kg,
                 body.drag_1_s * air[1] + force[1] / body.mass_kg,
                 body.drag_1_s * air[2] + force[2] / body.mass_kg + (body.gravity_m_s2 - STANDARD_GRAVITY_M_S2),
             )
-            known = self._disturbed = (air, force, disturbance)
-        return known[2]
+        return known
 
     def set_wind(self, wind_m_s: Vec3, turbulence: float) -> None:
         """Change the mean wind (NED) in a step, and its turbulence, from now on."""
         self._wind.set_wind(wind_m_s, turbulence)
-        self._engine.air_m_s = self._air()
+        self._blow()
 
     def set_gust(self, gust_m_s: Vec3 | None) -> None:
         """Add a velocity (NED) to that of the air from now on, in the place of the one added before; None: nothing."""
         self._gust_m_s = gust_m_s
-        self._engine.air_m_s = self._air()
+        self._blow()
 
-    def _air(self) -> Vec3:
+    def _blow(self) -> None:
+        """Let the air move as wind and gust say now."""
         air, gust = self._wind.air_m_s, self._gust_m_s
-        return air if gust is None else (air[0] + gust[0], air[1] + gust[1], air[2] + gust[2])
+        self._engine.air_m_s = air if gust is None else (air[0] + gust[0], air[1] + gust[1], air[2] + gust[2])
+        self._disturbance = None
 
     def set_force(self, force_n: Vec3) -> None:
         """Change the constant force (NED) from now on."""
         self._engine.force_n = force_n
+        self._disturbance = None

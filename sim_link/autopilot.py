@@ -103,7 +103,8 @@ class Autopilot:
         self._spool_up_s = 0.0
         self._parameters_version = -1
         self._took_off = in_air
-        self._offboard_ok = False
+        self.offboard_ok = False
+        """Whether a companion's setpoints come, as it was at the last check."""
         self._ground_us: int | None = None
         self._blind_us: int | None = None
         """Since when there is no estimate."""
@@ -207,14 +208,14 @@ class Autopilot:
     def attitude_target(self, message: AttitudeTarget) -> bool:
         """Take a SET_ATTITUDE_TARGET; returns whether it was accepted."""
         taken = self.offboard.take_attitude_target(message, self._now_us, self.mode is Mode.OFFBOARD)
-        if taken and not self._offboard_ok:
+        if taken and not self.offboard_ok:
             self._check()
         return taken
 
     def actuator_controls(self, message: ActuatorControls) -> bool:
         """Take a SET_ACTUATOR_CONTROL_TARGET; returns whether it was accepted."""
         taken = self.offboard.take_actuator_controls(message, self._now_us, self.mode is Mode.OFFBOARD)
-        if taken and not self._offboard_ok:
+        if taken and not self.offboard_ok:
             self._check()
         return taken
 
@@ -227,7 +228,7 @@ class Autopilot:
             wrong = self.offboard.take_position_target(message, self._now_us, active, self._rigid.q)
         if wrong is not None:
             self._say(CRITICAL, wrong)
-        if self.offboard.accepted > before and not self._offboard_ok:
+        if self.offboard.accepted > before and not self.offboard_ok:
             self._check()
 
     def manual_control(self, x: int = 0, y: int = 0, z: int = 500, r: int = 0) -> None:
@@ -291,11 +292,6 @@ class Autopilot:
             return True
         limit_s = self.parameters.number("COM_DL_LOSS_T")
         return self._ground_us is not None and (self._now_us - self._ground_us) * 1e-6 <= limit_s
-
-    @property
-    def offboard_ok(self) -> bool:
-        """Whether a companion's setpoints come, as it was at the last check."""
-        return self._offboard_ok
 
     @property
     def in_failsafe(self) -> bool:
@@ -464,7 +460,7 @@ class Autopilot:
         PX4 does so at 10 Hz, and at once when a lost signal returns.
         """
         blind = self.offboard.wants_trajectory and not self.estimate_ok
-        self._offboard_ok = self.offboard.signal_ok(self._now_us) and not blind
+        self.offboard_ok = self.offboard.signal_ok(self._now_us) and not blind
         self._evaluate()
 
     def _evaluate(self) -> None:
@@ -472,7 +468,7 @@ class Autopilot:
         decision = None
         if self.armed and not self.terminated:
             health = Health(
-                self._offboard_ok,
+                self.offboard_ok,
                 self.sticks_ok,
                 self._sticks_at_arming,
                 self.ground_ok,
@@ -519,7 +515,7 @@ class Autopilot:
     def _can_run(self, mode: Mode) -> bool:
         """Tell whether a mode has what it needs."""
         if mode is Mode.OFFBOARD:
-            return self._offboard_ok
+            return self.offboard_ok
         if mode is Mode.MISSION:
             return self.guidance.mission.can_run and self.estimate_ok
         return (self.sticks_ok or not mode.needs_sticks) and (self.estimate_ok or not mode.needs_estimate)

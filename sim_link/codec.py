@@ -49,6 +49,8 @@ SIGNATURE_LENGTH = 13
 AUTOPILOT_COMPONENT = 1
 """MAV_COMP_ID_AUTOPILOT1: what every vehicle's autopilot is."""
 _HEADER = struct.Struct("<BBBBBBBHB")
+_HEAD = struct.Struct("<BBBB")
+"""Length, both flags, sequence number."""
 _MAGIC_V2_BYTE = bytes((MAGIC_V2,))
 _WHOLE = 12
 """Bytes of a MAVLink 2 frame without its payload."""
@@ -303,7 +305,7 @@ class Encoder:
             known = self._known[msg_id] = sender, _CHECKED[msg_id][0]
         sequence = self.sequence
         self.sequence = (sequence + 1) & 0xFF
-        checked = bytes((len(body), signed, 0, sequence)) + known[0] + body
+        checked = _HEAD.pack(len(body), signed, 0, sequence) + known[0] + body
         frame = _MAGIC_V2_BYTE + checked + mcrf4xx(checked + known[1]).to_bytes(2, "little")
         return frame + signatures.tail(frame) if signed and signatures is not None else frame
 
