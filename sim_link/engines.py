@@ -281,10 +281,12 @@ class CompiledEngine:
         """Give the rows of the ring and of the noise that make an estimate, which is to be written."""
         self._written = sample = self._sample + steps_ahead
         blocks = self._blocks
-        if not 0 <= sample - blocks.first < len(blocks.rows):
+        noise = sample - blocks.first
+        if not 0 <= noise < blocks.count:
             blocks.move_to(sample)
             self._x[flat.NOISE : flat.RING] = blocks.rows.reshape(-1)
-        return (self._row + steps_ahead) % self._ring_rows, sample - blocks.first
+            noise = sample - blocks.first
+        return (self._row + steps_ahead) % self._ring_rows, noise
 
     def foresee(self, steps_ahead: int) -> None:
         """Let `run` write that estimate as well (see Engine)."""

@@ -92,6 +92,8 @@ class NoiseBlocks:
         self._block = -1
         self.first = 0
         """Number of the first sample of the block."""
+        self.count = 0
+        """How many samples it holds."""
         self.rows: np.ndarray = np.zeros((0, 12))
 
     def move_to(self, sample: int) -> bool:
@@ -102,6 +104,7 @@ class NoiseBlocks:
         self._block = block
         self.first = NOISE_ROWS * block
         self.rows = noise_block(self._seed, block)
+        self.count = NOISE_ROWS
         return True
 
 

@@ -147,18 +147,17 @@ class Telemetry:
         return codec.COVARIANCE.pack(*pose) + codec.COVARIANCE.pack(*velocity)
 
     def odometry(self) -> bytes | None:
-        """ODOMETRY: velocity is NED although PX4 could name a body frame; time_usec is the sample's.
+        """ODOMETRY of the present estimate; None while there is none, as for the other messages that tell one."""
+        return self.odometry_of(self._estimate) if self._autopilot.has_estimate else None
 
-        None while there is no estimate, as for the other messages that tell one.
-        """
-        if not self._autopilot.has_estimate:
-            return None
+    def odometry_of(self, estimate: Estimate) -> bytes:
+        """ODOMETRY: velocity is NED although PX4 could name a body frame; time_usec is the sample's."""
         if self._odometry_reset != self.reset_counter:
             self._odometry_reset = self.reset_counter
             self._odometry_rest = codec.ODOMETRY_REST.pack(
                 self._covariances, _LOCAL_NED, _LOCAL_NED, self.reset_counter, _ESTIMATOR_AUTOPILOT, 0
             )
-        t_us, p, v, q, w = self._estimate
+        t_us, p, v, q, w = estimate
         return codec.ODOMETRY_STATE.pack(t_us, *p, *q, *v, *w) + self._odometry_rest
 
     def attitude_quaternion(self) -> bytes | None:

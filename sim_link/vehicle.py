@@ -63,6 +63,8 @@ _OF_THE_PAST = frozenset(
 """Messages of what was estimated of the past, and of what the autopilot has decided already."""
 _OF_THE_ESTIMATE = _OF_THE_PAST - {ID_HEARTBEAT, ID_TIMESYNC}
 """Messages that go out with a new estimate only."""
+_STATE_ALONE = [ID_ODOMETRY]
+"""What goes out with nearly every state while a companion flies."""
 
 _LOOP_PARAMETERS = {
     "MC_ROLL_P": (0.0, 20.0),
@@ -367,14 +369,18 @@ class Vehicle:
 
     def _foretell(self, ids: Sequence[int], estimate: Estimate, now_us: int) -> Foretold | None:
         """Build the messages of the next state; what is told to whoever asks before it stays as it is."""
-        encoder = self.companion.encoder
-        sequence, built = encoder.sequence, []
-        for msg_id, content in self.telemetry.build_ahead(now_us, estimate, ids):
-            if not isinstance(content, bytes):
-                encoder.sequence = sequence
-                return None
-            built.append(encoder.hot(msg_id, content))
-        built.append(encoder.hot(ID_TIMESYNC, TIMESYNC.pack(0, now_us * 1000, 0, 0)))
+        telemetry, encoder = self.telemetry, self.companion.encoder
+        sequence, hot = encoder.sequence, encoder.hot
+        if ids == _STATE_ALONE and self.autopilot.has_estimate:
+            built = [hot(ID_ODOMETRY, telemetry.odometry_of(estimate))]
+        else:
+            built = []
+            for msg_id, content in telemetry.build_ahead(now_us, estimate, ids):
+                if not isinstance(content, bytes):
+                    encoder.sequence = sequence
+                    return None
+                built.append(hot(msg_id, content))
+        built.append(hot(ID_TIMESYNC, TIMESYNC.pack(0, now_us * 1000, 0, 0)))
         encoder.sequence = sequence  # nothing is sent yet
         return Foretold(now_us, sequence, estimate, built)
 
