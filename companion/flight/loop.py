@@ -72,6 +72,8 @@ LOCKSTEP_SPIN_S = 0.0005
 HEARTBEAT_INTERVAL_S = 1.0
 IDLE_WAIT_S = 0.1
 BUSY_WAIT_S = 0.01
+WAIT_STEP_S = 0.001
+"""A wait is counted in milliseconds."""
 _MSGID_AT = 7
 _ATTITUDE_LOW = bytes((codec.ATTITUDE_QUATERNION,))
 AWAY_NS = 25_000_000
@@ -382,8 +384,14 @@ class FlightLoop:
         self._look_at_the_wall_clock()
 
     def _wait_s(self) -> float:
-        idle = self._peer.paced or (self._sequence.duty is Duty.NOTHING and self._sequence.ending is None)
-        return IDLE_WAIT_S if idle else BUSY_WAIT_S
+        """How long to wait for the link: while states are answered, until they would have ceased."""
+        sequence = self._sequence
+        if self._peer.paced or (sequence.duty is Duty.NOTHING and sequence.ending is None):
+            return IDLE_WAIT_S
+        if sequence.duty is not Duty.TRACK or sequence.ending is not None:
+            return BUSY_WAIT_S
+        silent_s = (self._turned_ns - self._last_arrival_ns) * 1e-9
+        return min(max(self._silence_s - silent_s + WAIT_STEP_S, WAIT_STEP_S), IDLE_WAIT_S)
 
     def _look_at_the_wall_clock(self) -> None:
         """What does not wait for the vehicle's time: the operator's wish, and a vehicle that says nothing more."""
@@ -591,6 +599,8 @@ class FlightLoop:
             begin_s, *where, state.q, thrust_n, adaptation=self._adaptation, origin_m=course.origin
         )
         self._engaged(self._engagement)
+        if self._streams is not None:
+            self._streams.on_engaged(self._ops, self._last_state_s)
 
     def _keep_changes(self, *, ended: bool = False) -> None:
         """Notes and tells how the course's pace, the law's parameters and the delay were changed.

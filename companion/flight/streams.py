@@ -19,6 +19,8 @@ from companion.link.wire import Wire
 NOT_NEEDED: Final = (24, 30, 32, 33, 36, 62, 65, 74, 85, 87, 105, 141)
 """GPS_RAW_INT, ATTITUDE, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, NAV_CONTROLLER_OUTPUT, RC_CHANNELS,
 VFR_HUD, POSITION_TARGET_LOCAL_NED, POSITION_TARGET_GLOBAL_INT, HIGHRES_IMU, ALTITUDE."""
+ATTITUDE_TARGET: Final = 83
+"""Tells the thrust of the autopilot's own hover."""
 ATTITUDE_INTERVAL_US: Final = 3_200
 """PX4 has an attitude at each of its 4 ms."""
 STATES_JUDGED: Final = 300
@@ -66,12 +68,17 @@ class Streams:
             interval_us = STOP_MESSAGE if self._exclusive else DEFAULT_INTERVAL
             ops.set_message_interval(codec.ATTITUDE_QUATERNION, interval_us, now_s)
 
+    def on_engaged(self, ops: Operations, now_s: float) -> None:
+        """The controller has taken over: what the autopilot's own hover was told by is of no use any more."""
+        if self._exclusive:
+            ops.set_message_interval(ATTITUDE_TARGET, STOP_MESSAGE, now_s)
+
     def leave(self, wire: Wire, system: int, component: int) -> None:
         """Asks for what was left out at its usual rate again, if the requests arrive: nobody waits. Never raises."""
         if not self._exclusive or self._paced:
             return
         with contextlib.suppress(Exception):
-            for msgid in (*NOT_NEEDED, codec.ATTITUDE_QUATERNION):
+            for msgid in (*NOT_NEEDED, codec.ATTITUDE_QUATERNION, ATTITUDE_TARGET):
                 params = (float(msgid), float(DEFAULT_INTERVAL), *(0.0,) * 5)
                 payload = codec.encode_command_long(system, component, Command.SET_MESSAGE_INTERVAL, 0, params)
                 wire.send(codec.COMMAND_LONG, payload)

@@ -34,7 +34,8 @@ class OffsetFilter:
         """The offset by the last second alone, at once: for judging, not for flying by. A simulated autopilot's clock
         stalls with its machine, which the offset that is flown by follows too slowly to tell from old states."""
         self._asked: dict[int, None] = {}
-        self._exchanges: deque[tuple[int, ClockOffset]] = deque()
+        self._best = _Least(WINDOW_NS)
+        self._recent = _Least(RECENT_NS)
         self._used_ns: float | None = None
         self._target_ns = 0
         self._at_ns = 0
@@ -51,13 +52,9 @@ class OffsetFilter:
             return False
         del self._asked[message.ts1]
         exchange = clock_offset(message, received_ns)
-        exchanges = self._exchanges
-        exchanges.append((received_ns, exchange))
-        while received_ns - exchanges[0][0] > WINDOW_NS:
-            exchanges.popleft()
-        best = min(exchanges, key=lambda known: known[1].round_trip_ns + DRIFT * (received_ns - known[0]))[1]
-        recent = (known[1] for known in exchanges if received_ns - known[0] <= RECENT_NS)
-        self.recent_ns = min(recent, key=lambda known: known.round_trip_ns).offset_ns
+        # Of two exchanges the difference between what they count stays as they age.
+        best = self._best.add(received_ns, exchange.round_trip_ns - DRIFT * received_ns, exchange)
+        self.recent_ns = self._recent.add(received_ns, exchange.round_trip_ns, exchange).offset_ns
         self.offset_ns(received_ns)
         self.answered_ns = received_ns
         self.round_trip_ns, self._target_ns = best.round_trip_ns, best.offset_ns
@@ -78,3 +75,26 @@ class OffsetFilter:
         self._used_ns += min(max(self._target_ns - self._used_ns, -most), most)
         self._at_ns = max(own_ns, self._at_ns)
         return round(self._used_ns)
+
+
+class _Least:
+    """The least of what came within a window; of equal ones the oldest.
+
+    Args:
+        window_ns: how long something counts.
+    """
+
+    def __init__(self, window_ns: int) -> None:
+        self._window_ns = window_ns
+        self._kept: deque[tuple[int, float, ClockOffset]] = deque()
+        """When it came, what it is judged by, and what it is; each is less than all that came after it."""
+
+    def add(self, at_ns: int, value: float, exchange: ClockOffset) -> ClockOffset:
+        """Takes another one; returns the least within the window."""
+        kept = self._kept
+        while kept and kept[-1][1] > value:
+            kept.pop()
+        kept.append((at_ns, value, exchange))
+        while at_ns - kept[0][0] > self._window_ns:
+            kept.popleft()
+        return kept[0][2]
