@@ -640,8 +640,8 @@ class FlightLoop:
         tracker = self._tracker
         if self._sequence.duty is not Duty.TRACK or not isinstance(tracker, Tracker):
             return 0
-        used, count = self._use_attitudes(datagrams, 0, tracker), len(datagrams)
-        if used == count:
+        used = self._use_attitudes(datagrams, 0, tracker)
+        if used == len(datagrams):
             return used
         for datagram in datagrams[used + 1 :]:  # what came behind a state may be newer than it
             frame = self._attitude_in(datagram)

@@ -211,6 +211,7 @@ class CompiledEngine:
         self._bytes = m.data.cast("B")
         self._pack = struct.Struct(f"{fused.INPUT + flat.THRUST_NOW}d").pack_into
         self._pack_reference = struct.Struct("18d").pack_into
+        self._pack_curve = struct.Struct("3d").pack_into
         self._unpack = struct.Struct(f"{flat.RESULTS}d").unpack_from
         self._unpack_rest = struct.Struct(f"{fused.SIZE - fused.SHARE}d").unpack_from
 
@@ -288,12 +289,12 @@ class CompiledEngine:
 
     def refer(self, timed: Timed, stamp_s: float, delay_s: float) -> Any:
         """Gives the next step its reference, for a state with this stamp [s]; returns the curve that it is on."""
-        m, curve = self._m, timed.curve(stamp_s, delay_s)
+        curve = timed.curve(stamp_s, delay_s)
         if curve is None:
-            m[fused.ON_CURVE] = 0.0
+            self._doubles[fused.ON_CURVE] = 0.0
             self._give(timed(stamp_s + delay_s))
             return self._no_curve
-        m[fused.ON_CURVE], m[fused.BEGIN], m[fused.JOIN] = 1.0, timed.begin_s, curve.begin_s
+        self._pack_curve(self._bytes, 8 * fused.ON_CURVE, 1.0, timed.begin_s, curve.begin_s)
         return curve.numbers
 
     @property
@@ -314,7 +315,7 @@ class CompiledEngine:
     def give_attitude(self, attitude: Attitude | None) -> None:
         """One that is newer than the next state, if there is one."""
         if attitude is None:
-            self._m[fused.ATTITUDE] = 0.0
+            self._doubles[fused.ATTITUDE] = 0.0
         else:
             self._m[fused.ATTITUDE : fused.RESULTS] = attitude.at_s, *attitude.q, *attitude.w
 

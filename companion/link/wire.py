@@ -255,8 +255,8 @@ class Wire:
 
     def _use_datagrams(self, datagrams: list[Datagram], frames: list[Frame], unknown: list[bytes]) -> None:
         """Use datagrams before which nothing waits to be used."""
-        used = 0
-        if self.at_once is not None and self._guard is None and all(sent[1] == self.peer for sent in datagrams):
+        used, peer = 0, self.peer
+        if self.at_once is not None and self._guard is None and all([address == peer for _, address, _ in datagrams]):
             used = self.at_once(datagrams)
             if used:
                 self._heard_ns = datagrams[used - 1][2]
