@@ -207,7 +207,7 @@ class CompiledEngine:
         self._no_history = np.zeros(history.CAPACITY)
         self._lags = lags
         self.retune(parameters)
-        self._doubles = m.data
+        self._doubles: Any = m.data
         self._bytes = m.data.cast("B")
         self._pack = struct.Struct(f"{fused.INPUT + flat.THRUST_NOW}d").pack_into
         self._pack_reference = struct.Struct("18d").pack_into

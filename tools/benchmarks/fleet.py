@@ -25,7 +25,8 @@ from .common import PYTHON, NotHereError, Row, Setting, running, verdict
 
 COUNT, RATE_HZ = 20, 100.0
 FIRST_PORT = 27540
-START_S = 90.0
+APART_S = 6.0
+"""Between the starts of two companions."""
 REACH = "late steps <= 1 %"
 TRAJECTORY = """shape = "circle"
 anchor = "here"
@@ -52,7 +53,7 @@ class Fleet(NamedTuple):
     """States that a newer one overtook before they were answered."""
     window_s: float
     vehicles_share: float
-    """Of a core, that the vehicles' process took, over its whole life."""
+    """Of a core, that the vehicles' process took while all of them flew."""
     step_us: tuple[float, float]
 
 
@@ -62,7 +63,7 @@ def fly(seconds: float, setting: Setting) -> Fleet:
     text = find("bundled", "vehicles").read_text(encoding="utf-8")
     vehicle_file.write_text(text.replace("state_rate_hz = 250.0", f"state_rate_hz = {RATE_HZ}"), encoding="utf-8")
     trajectory = setting.folder / "small-circle.toml"
-    trajectory.write_text(TRAJECTORY.format(seconds=seconds), encoding="utf-8")
+    trajectory.write_text(TRAJECTORY.format(seconds=seconds + COUNT * APART_S), encoding="utf-8")
     flight = {"name": "fleet", "vehicle": str(vehicle_file), "trajectory": str(trajectory)}
     configured = embedded(build_flight(flight, "tools/bench.py", adjustments()), None)
     folders = [prepare(configured, setting.folder / f"fleet-{i}-{time.monotonic_ns()}") for i in range(COUNT)]
@@ -83,25 +84,23 @@ def fly(seconds: float, setting: Setting) -> Fleet:
     engine = "numba" if available() else "python"
     threads = []
     lines: list[list[Mapping[str, object]]] = [[] for _ in folders]
-    for i, folder in enumerate(folders):
-        arguments = (folder, f"udpin:127.0.0.1:{FIRST_PORT + i}", engine, 120.0, lines[i].append)
-        threads.append(threading.Thread(target=control, args=arguments, daemon=True))
-        threads[-1].start()
-    # Twenty programs that start are no measure of twenty that fly: the vehicles come when all of them listen.
-    begin_s = time.monotonic()
-    while not all(any("ready" in told for told in of) for of in lines):
-        if time.monotonic() - begin_s > START_S:
-            raise NotHereError("not all companions started")
-        time.sleep(0.2)
-    setting.say("all companions listen")
     with running(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         if not json.loads(process.stdout.readline() or "{}").get("ready"):
             raise NotHereError("the vehicles did not start")
+        # One after the other: twenty programs that start, and twenty courses that are planned, are no measure of
+        # twenty that fly.
+        for i, folder in enumerate(folders):
+            arguments = (folder, f"udpin:127.0.0.1:{FIRST_PORT + i}", engine, 120.0, lines[i].append)
+            threads.append(threading.Thread(target=control, args=arguments, daemon=True))
+            threads[-1].start()
+            time.sleep(APART_S)
+        setting.say("all companions are started")
         begin_s, begin_cpu_s = time.monotonic(), _cpu_s(process.pid)
+        time.sleep(0.5 * seconds)
+        share = (_cpu_s(process.pid) - begin_cpu_s) / (time.monotonic() - begin_s)
         for thread in threads:
             thread.join(timeout=240.0)
-        share = (_cpu_s(process.pid) - begin_cpu_s) / (time.monotonic() - begin_s)
     short = [told[-2:] for folder, told in zip(folders, lines, strict=True) if not _steps(folder)]
     if short:
         said = next((told["outcome"] for told in short[0] if "outcome" in told), "nothing")
