@@ -305,12 +305,12 @@ class CompiledEngine:
     @property
     def on_curve(self) -> bool:
         """Whether the last step had its reference from a curve."""
-        return self._doubles[fused.ON_CURVE] > 0.5
+        return bool(self._doubles[fused.ON_CURVE] > 0.5)
 
     @property
     def refreshed(self) -> bool:
         """Whether the last step predicted from an attitude newer than its state."""
-        return self._doubles[fused.REFRESHED] > 0.5
+        return bool(self._doubles[fused.REFRESHED] > 0.5)
 
     def give_attitude(self, attitude: Attitude | None) -> None:
         """One that is newer than the next state, if there is one."""
