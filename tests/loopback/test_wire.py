@@ -210,14 +210,15 @@ def test_udpout_speaks_first_and_hears_the_answer():
 
 
 def test_udpout_survives_that_nobody_listens():
-    port = free_port()
-    with Wire.open(f"udpout:127.0.0.1:{port}") as wire:
+    # An address of its own: on the usual one somebody else's vehicle may be given the port meanwhile, and answers.
+    host, port = "127.0.0.9", free_port()
+    with Wire.open(f"udpout:{host}:{port}") as wire:
         for _ in range(5):
             wire.send(0, codec.encode_heartbeat())
             assert wire.receive(0.02) == []
         assert wire.counters.unreachable > 0
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
-            vehicle.bind(("127.0.0.1", port))
+            vehicle.bind((host, port))
             vehicle.settimeout(2.0)
             assert wire.send(0, codec.encode_heartbeat())
             _, address = vehicle.recvfrom(300)

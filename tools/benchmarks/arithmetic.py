@@ -10,6 +10,7 @@ import json
 import os
 import re
 import shutil
+import struct
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,7 +20,11 @@ from companion import accelerate
 from companion.config import find, load_flight
 from companion.control.types import State
 from companion.flight.course import Course, Timed
+from companion.flight.reflex import ANSWERED, Reflex
 from companion.flight.tracker import Tracker, kernels
+from companion.link import codec
+from companion.link.framing import build_frame
+from companion.link.telemetry import Telemetry
 from companion.trajectory.load import load
 from sim_link import vehicle_file
 from sim_link.airframe import Airframe
@@ -96,6 +101,35 @@ def control_step(engine: str) -> Callable[[int], object]:
     return lambda i: tracker.step(1.0 + 0.004 * i, state, reference_at)
 
 
+def reflex_step(count: int) -> Callable[[int], object]:
+    """So many answers by reflex: from a state's datagram to the setpoint's, checks and frames included; compiled."""
+    vehicle = load_flight("paper").vehicle
+    course = Course(replace(load("paper"), duration_s=FLOWN_S), vehicle, (0.0, 0.0, -10.0), 0.0, None)
+    p, v, q, w = (0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1)
+    tracker, telemetry, reflex = Tracker(vehicle, "rates", kernels("numba")), Telemetry(1), Reflex(1, (1, 191))
+    tracker.begin(State(p, v, q, w))
+    timed, extra = Timed(course, 0.0), codec.message_formats()[codec.ODOMETRY].crc_extra
+    layout = struct.Struct("<Q13f168x4Bb")
+    datagrams = []
+    for i in range(count):
+        payload = layout.pack(1_000_000 + 4_000 * i, p[0] + 1e-4 * i, *p[1:], *q, *v, *w, 1, 1, 0, 8, 50)
+        datagrams.append(build_frame(codec.ODOMETRY, payload, i & 0xFF, 1, 1, extra))
+    tracker.step(0.996, State(p, v, q, w), timed)
+    telemetry.took(996_000, (p, v, q, w))
+
+    def answer(i: int) -> bytes:
+        last_us = 996_000 + 4_000 * i
+        given = (i & 0xFF, i & 0xFF, 1, last_us, last_us, -1, 0, 500_000)
+        assert telemetry.numbers is not None
+        if not reflex.take(datagrams[i], given, telemetry.numbers) or tracker.answer(reflex, timed) != ANSWERED:
+            raise RuntimeError("not answered by reflex")
+        state, telemetry.numbers = reflex.told()
+        tracker.answered(state.t_vehicle_us * 1e-6, State(*state[1:5]))
+        return reflex.output.tobytes()
+
+    return answer
+
+
 def physics_steps(engine: str, count: int) -> Callable[[int], object]:
     """So many physics steps of the bundled vehicle with its inner loops, as the simulated vehicle runs them."""
     vehicle = vehicle_file.load(str(find("bundled", "vehicles")))
@@ -111,13 +145,16 @@ def engines() -> list[str]:
 def control_rows(setting: Setting) -> list[Row]:
     """The control step against SE3Control.update."""
     calls = {engine: control_step(engine) for engine in engines()}
+    rounds = 3 if setting.quick else ROUNDS
+    if "numba" in calls:
+        calls["reflex"] = reflex_step(300 + rounds * CALLS)
     for call in calls.values():
         times_us(call, 300)
     ours: dict[str, list[float]] = {engine: [] for engine in calls}
     theirs: list[float] = []
     with rotorpy(setting) as other:
         other.ask("controller", 100)
-        for i in range(3 if setting.quick else ROUNDS):
+        for i in range(rounds):
             setting.say(f"control step, round {i + 1}")
             theirs += other.ask("controller", CALLS)
             for engine, call in calls.items():
@@ -132,6 +169,11 @@ def control_rows(setting: Setting) -> list[Row]:
         against = f"RotorPy SE3Control.update, p50 / p99 {a:.0f} / {b:.0f} us"
         what = f"control step as the loop calls it, {engine}"
         rows.append(Row(what, against, f">= {reach:.0f} times faster", seen, verdict(a / p50 >= reach)))
+    if "reflex" in ours:
+        p50, p99 = p50_p99(ours["reflex"])
+        what = "state datagram to setpoint datagram by reflex, checks and frames included, numba"
+        seen = f"{p50:.1f} / {p99:.1f} us: {a / p50:.1f} / {b / p99:.1f} times faster"
+        rows.append(Row(what, against, "", seen, ""))
     return rows
 
 
