@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import pytest
@@ -72,6 +73,16 @@ class Message:
     """When a newer attitude came, after this state's stamp."""
 
 
+VEHICLE = load_vehicle("bundled")
+
+
+@cache
+def course(shape: Any) -> Course:
+    """Planned once."""
+    trajectory = Trajectory(name="t", shape=shape, duration_s=20.0)
+    return Course(trajectory, VEHICLE, (0.0, 0.0, -10.0), 0.0, None)
+
+
 @dataclass
 class Way:
     """One companion's half of a link."""
@@ -82,13 +93,11 @@ class Way:
     sent: list[bytes] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        vehicle = load_vehicle("bundled")
-        course = Course(Trajectory(name="t", shape=self.shape, duration_s=20.0), vehicle, (0.0, 0.0, -10.0), 0.0, None)
-        self.timed = Timed(course, BEGIN_US * 1e-6)
+        self.timed = Timed(course(self.shape), BEGIN_US * 1e-6)
         self.counters = LinkCounters()
         self.parser = FrameParser(FORMATS, self.counters)
         self.telemetry = Telemetry(1)
-        self.tracker = Tracker(vehicle, "rates", kernels("numba"))
+        self.tracker = Tracker(VEHICLE, "rates", kernels("numba"))
         self.tracker.begin(State((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
         self.sender = SetpointSender(self.frame, 1)
         self.reflex = Reflex(1, OWN)
@@ -296,7 +305,7 @@ MESSAGE = st.builds(
 
 
 @pytest.mark.numba
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_whatever_comes_both_ways_do_the_same(data: st.DataObject) -> None:
     lockstep = data.draw(st.booleans(), "lockstep")
