@@ -188,7 +188,6 @@ class Peer:
                 if link.faults is not None:
                     for frame in link.faults.released():
                         self._obey(frame, link)
-            self._flush()
         # The companion is at work now: what else there is to do costs nobody any time.
         vehicle.look_ahead()
         self._refill()
@@ -333,6 +332,8 @@ class Peer:
     def _wait_for_time(self) -> None:
         """Act on what comes until the wall clock has caught up with the vehicle's."""
         self._set_deadline()
+        if self.vehicle.companion.outbox or self.vehicle.ground.outbox:  # what the state's own datagrams had not yet
+            self._flush()
         has_listened = False  # which it does at least once, however late it is
         while True:
             left_s = self._deadline_s - time.monotonic()
@@ -461,6 +462,7 @@ class Peer:
             return
         link.speak()
         if frame.msg_id == ID_TIMESYNC:
+            self.vehicle.forget_foretold()
             self._timesync(frame, link, False)
         else:
             self.vehicle.receive(frame, link)

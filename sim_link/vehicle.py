@@ -280,9 +280,13 @@ class Vehicle:
         """Give an estimate of the physics the stamp of the vehicle's time."""
         return estimate if self._boot_us == 0 else estimate._replace(t_us=max(0, estimate.t_us - self._boot_us))
 
+    def forget_foretold(self) -> None:
+        """Tell the next state when its time has come: something was heard that may concern it."""
+        self._foretold = None
+
     def receive(self, frame: Frame, link: Link) -> None:
         """Act on a message that came on a link, at the present vehicle time."""
-        self._foretold = None  # whatever it asks for may concern the next state
+        self.forget_foretold()
         self.services.handle(frame, link, self.t_us)
 
     def tick(self, queued: Callable[[int], None] = _nobody) -> None:
@@ -298,7 +302,8 @@ class Vehicle:
             if self.booting:
                 self._wait_for_boot(queued)
                 return
-        if airframe.beliefs.version != self._beliefs_version:
+        disturbed = airframe.beliefs.version != self._beliefs_version
+        if disturbed:
             self._obey_beliefs()
         telemetry, period_us, left = self.telemetry, self.period_us, self.steps_per_tick
         now_us = airframe.t_us - self._boot_us + period_us
@@ -309,14 +314,14 @@ class Vehicle:
         ]
         told, self._told_ahead = self._told_ahead, None
         if told is not None and not due[1]:
-            early, believed = True, told.estimate
+            early = True
+            believed = self._dated(airframe.believed(left)) if disturbed else told.estimate
             telemetry.update(now_us, believed)
             queued(now_us)
         elif early := left <= airframe.age_steps and self._tell_the_past(due):
             believed = self._dated(airframe.believed(left))
             telemetry.update(now_us, believed)
-            if told is None:
-                self._publish(due, now_us)
+            self._publish(due if told is None else [[], due[1]], now_us)
             queued(now_us)
         while left > 0:
             left -= self._fly(left)
@@ -390,7 +395,9 @@ class Vehicle:
         The companion's setpoint acts on the motion, and what is told is the past. None: the state must wait for `tick`.
         """
         foretold, encoder = self._foretold, self.companion.encoder
-        if foretold is None or encoder.sequence != foretold.sequence or self.airframe.t_us >= self.faults.next_us:
+        if foretold is None or encoder.sequence != foretold.sequence or self.companion.outbox:
+            return None
+        if self.airframe.t_us >= self.faults.next_us:
             return None
         encoder.sequence = (foretold.sequence + len(foretold.frames)) & 0xFF
         self._told_ahead, self._foretold = foretold, None

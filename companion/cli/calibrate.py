@@ -201,7 +201,8 @@ def configured(
     }
     if start:
         data["start"] = {"position_m": [*START_M, -height_m]}
-    return build_flight(data, "command line", adjustments())
+    # What the file to begin with says of its own vehicle's link need not hold for this one.
+    return build_flight(data, "command line", adjustments(vehicle__link__exclusive=False))
 
 
 def _fly(

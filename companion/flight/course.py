@@ -76,7 +76,7 @@ def _curves(pieces: Iterable[tuple[Anchored | Join, float]]) -> Iterator[Curve]:
     for piece, begin_s in pieces:
         numbers = curve_of(piece)
         if numbers is not None:
-            yield Curve(begin_s, begin_s + piece.duration_s, np.array(numbers))
+            yield Curve(begin_s, piece.duration_s, np.array(numbers))
 
 
 class Part(Enum):
@@ -100,7 +100,7 @@ class Curve(NamedTuple):
 
     begin_s: float
     """Time on the course at which it begins [s]."""
-    end_s: float
+    duration_s: float
     numbers: NDArray[np.float64]
     """See `trajectory.curve`."""
 
@@ -236,7 +236,8 @@ class Course:
 
     def course_s(self, t_s: float) -> float:
         """Time on the course [s], `t_s` after engaging."""
-        return self._tempo.at(t_s)[0]
+        tempo = self._tempo
+        return t_s if tempo.steady else tempo.at(t_s)[0]
 
     def resting(self, t_s: float) -> bool:
         """Whether the pace is zero from now on, until it is changed."""
@@ -286,14 +287,15 @@ class Timed:
 
         It goes by the times alone: a replay, which knows all changes of the pace from its beginning, takes the same.
         """
-        course, curve, now_s = self.course, self._curve, stamp_s - self.begin_s
-        effect_s = now_s + delay_s
+        course, curve = self.course, self._curve
+        # in the order in which `fused.flight_step` works them out: at an end the last digit counts
+        now_s, effect_s = stamp_s - self.begin_s, stamp_s + delay_s - self.begin_s
         if curve is None or effect_s >= course.changes_s:
             return None
-        if curve.begin_s <= now_s and effect_s < curve.end_s:  # as the last time
+        if now_s >= curve.begin_s and effect_s - curve.begin_s <= curve.duration_s:  # as the last time
             return curve
         for other in course.curves:
-            if other.begin_s <= now_s and effect_s < other.end_s:
+            if now_s >= other.begin_s and effect_s - other.begin_s <= other.duration_s:
                 self._curve = other
                 return other
         return None

@@ -156,22 +156,25 @@ class Guards:
         self.envelope: Envelope | None = None
         """Of V_H; None where the law does not fly."""
         self._p_max, self._ball = vehicle.controller.position_error_max_m, vehicle.limits.disturbance_max_m_s2
+        self._calm = self._calm_limits()
         if parameters is not None:
             self.retune(parameters)
 
     def retune(self, parameters: Parameters) -> None:
         """Other gains are flown from now on."""
         self._p_max, self._ball = parameters.gains.p_max, parameters.limits.disturbance_max
+        self._calm = self._calm_limits()
         self.envelope = Envelope(parameters.gains, parameters.model.drag, disturbance_step(self._limits), self._engine)
+
+    def _calm_limits(self) -> tuple[float, float, float]:
+        limits = self._limits
+        return min(limits.position_error_abort_m, self._p_max), self._tilt_cosine, limits.rate_error_max_rad_s
 
     @property
     def calm(self) -> tuple[float, float, float] | None:
         """The largest error [m], smallest cosine of the tilt and largest error of the rates [rad/s] with which `step`
         finds nothing, if the envelope is kept and nothing is saturated; None: `step` must look itself."""
-        if self._since or not self._near:
-            return None
-        limits = self._limits
-        return min(limits.position_error_abort_m, self._p_max), self._tilt_cosine, limits.rate_error_max_rad_s
+        return self._calm if self._near and not self._since else None
 
     def restart(self) -> None:
         """The flight begins anew for the guards of the errors: the estimate was reset."""

@@ -643,13 +643,15 @@ class FlightLoop:
         used = self._use_attitudes(datagrams, 0, tracker)
         if used == len(datagrams):
             return used
+        newest_us = -1
         for datagram in datagrams[used + 1 :]:  # what came behind a state may be newer than it
             frame = self._attitude_in(datagram)
-            if frame is None:
+            if frame is None or self._peer.paced:
                 return used
             sample = self._telemetry.read_attitude(frame)
-            if not isinstance(sample, StateRejection):
-                tracker.refresh(Attitude(sample.t_vehicle_us * 1e-6, sample.q, sample.w))
+            if not isinstance(sample, StateRejection) and sample.t_vehicle_us > newest_us:
+                newest_us = sample.t_vehicle_us
+                tracker.refresh(Attitude(newest_us * 1e-6, sample.q, sample.w))
         if not self._answer_at_once(datagrams[used][0], datagrams[used][2], tracker):
             return used
         return self._use_attitudes(datagrams, used + 1, tracker)
@@ -687,7 +689,7 @@ class FlightLoop:
         reflex, system, paced = self._reflex, self._ops.target_system, self._peer.paced
         assert reflex is not None
         asked_us = self._peer.asked_us if paced else -1
-        if asked_us is None:
+        if asked_us is None or (paced and asked_us < 0):
             return False
         given = (*self._wire.due(system, AUTOPILOT_COMPONENT), time.monotonic_ns(), last_us, sent_us, asked_us)
         if not reflex.take(datagram, (*given, last.reset_counter, self._own_silence_us()), before):
@@ -728,6 +730,8 @@ class FlightLoop:
             peer.on_request(asked_ns)
             clock.on_timesync(asked_ns, wall_ns)
         now_s = clock.now_s(wall_ns)
+        if self._streams is not None:
+            self._streams.on_state(state.t_vehicle_us, wall_ns, self._ops, now_s)
         self._last_state, self._last_state_s, self._last_arrival_ns = state, now_s, wall_ns
         sequence.on_state(state, now_s)
         tracker.answered(state.t_vehicle_us * 1e-6, new_record(State, state[1:5]))

@@ -224,6 +224,8 @@ def warm_up(flight: Any, compiled: Any) -> None:
     """Compiles or loads what a control step needs, before anything connects: nothing is compiled in the air."""
     from companion.control.types import State
     from companion.flight.course import at_rest
+    from companion.flight.following import Following
+    from companion.flight.reckoning import Reckoner
     from companion.flight.reflex import Reflex
 
     tracker = controller_of(flight, compiled)
@@ -234,6 +236,8 @@ def warm_up(flight: Any, compiled: Any) -> None:
         tracker.step(1.0 + i / flight.vehicle.link.state_rate_hz, state, lambda t: at_rest(zero, 0.0))
     if compiled.engine == "numba":
         Reflex(1, (1, COMPANION_COMPONENT))
+        Reckoner()
+        Following(flight.vehicle.autopilot.rate_lag_s, compiled.engine)
 
 
 def _finish(

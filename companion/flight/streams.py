@@ -47,6 +47,8 @@ class Streams:
             self.intervals_us[codec.ATTITUDE_QUATERNION] = STOP_MESSAGE
         elif predicts:
             self.intervals_us[codec.ATTITUDE_QUATERNION] = ATTITUDE_INTERVAL_US
+        if self._exclusive:  # a flight before this one may have left it switched off
+            self.intervals_us[ATTITUDE_TARGET] = DEFAULT_INTERVAL
         self._attitudes = Attitudes() if predicts and not paced else None
 
     def on_attitude(self, t_us: int, wall_ns: int) -> None:
@@ -78,7 +80,7 @@ class Streams:
         if not self._exclusive or self._paced:
             return
         with contextlib.suppress(Exception):
-            for msgid in (*NOT_NEEDED, codec.ATTITUDE_QUATERNION, ATTITUDE_TARGET):
+            for msgid in (ATTITUDE_TARGET, codec.ATTITUDE_QUATERNION, *NOT_NEEDED):
                 params = (float(msgid), float(DEFAULT_INTERVAL), *(0.0,) * 5)
                 payload = codec.encode_command_long(system, component, Command.SET_MESSAGE_INTERVAL, 0, params)
                 wire.send(codec.COMMAND_LONG, payload)

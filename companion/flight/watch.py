@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.config import Flight
 from companion.control import flat
-from companion.control.types import State, Vec3
+from companion.control.types import State, Vec3, new_record
 from companion.flight.clearance import own_fence_margins
 from companion.flight.controller import Controller
 from companion.flight.course import Course
@@ -178,7 +178,7 @@ class Watch:
             return None
         if following is None or envelope is None or limits is None or now_s - self._slowly_s >= SLOWLY_S - 1e-6:
             return None
-        return Calm(limits, self._tracker.delay_s, envelope.numbers, following.numbers)
+        return new_record(Calm, (limits, self._tracker.delay_s, envelope.numbers, following.numbers))
 
     def on_calm_step(self, age_s: float | None, now_s: float, *, late: bool) -> None:
         """A control step was found to need no judging, by `calm`."""

@@ -124,6 +124,8 @@ def written(template: str, values: Mapping[str, Any], calibration: Mapping[str, 
     while lines and (not lines[0].strip() or lines[0].startswith("#")):  # what is said there is of another vehicle
         del lines[0]
     document = tomlkit.parse("\n".join(lines) + "\n")
+    link: Any = document["link"]
+    link.pop("exclusive", None)  # whether anybody else listens was known of another vehicle's link
     for dotted, value in values.items():
         *tables, key = dotted.split(".")
         table: Any = document

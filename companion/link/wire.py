@@ -219,8 +219,9 @@ class Wire:
                 if address == self.peer and data[:1] == _V2 and int.from_bytes(data[_MSGID], "little") in until:
                     end = i + 1
                     break
-        self._use_datagrams(unread[:end], frames, unknown)
+        datagrams = unread[:end]
         del unread[:end]
+        self._use_datagrams(datagrams, frames, unknown)
 
     def keep(self, frames: list[Frame]) -> None:
         """Have frames that were received and not used yet received again, before all others."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from calibration_cases import calibration_flight, fly, hover_share
 
-from companion.config import CalibrationFlight, load_vehicle
+from companion.config import CalibrationFlight, find, load_vehicle
 from companion.control.hover import hover
 from companion.control.types import GRAVITY_M_S2, State
 from companion.control.vectors import quat_exp
@@ -218,6 +218,9 @@ def test_the_bundled_vehicle_is_found(tmp_path) -> None:
     entered = Entered("mine", 1.1, 0.1, False)
     values = vehicle_values(template_of("px4_sih"), entered, found, facts)
     text = written("px4_sih", values, provenance(found, facts, entered, source.path, date(2026, 11, 27)))
+    other = written("bundled", values, provenance(found, facts, entered, source.path, date(2026, 11, 27)))
+    assert "exclusive = true" in find("bundled", "vehicles").read_text()
+    assert "exclusive" not in other, "who else listens there nobody has told"
     path = tmp_path / "mine.toml"
     path.write_text(text)
     vehicle = load_vehicle(str(path))

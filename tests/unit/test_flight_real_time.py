@@ -447,8 +447,11 @@ def numbered(raw: bytes, seq: int) -> bytes:
     return raw[:1] + body + mcrf4xx(body + bytes((extra,))).to_bytes(2, "little")
 
 
-def attitudes_behind(age_us: int) -> Callable[[list[bytes]], list[bytes]]:
-    """Behind every state comes an attitude that is so much newer, as on PX4; the vehicle's own do not come."""
+def attitudes_behind(age_us: int, older_us: int) -> Callable[[list[bytes]], list[bytes]]:
+    """Behind every state comes an attitude that is so much newer, as on PX4; the vehicle's own do not come.
+
+    Where `older_us` is not 0 another one overtaken on its way follows, so much older.
+    """
     count, encoder = [0], codec.Encoder(1, 1)
 
     def add(datagrams: list[bytes]) -> list[bytes]:
@@ -460,8 +463,9 @@ def attitudes_behind(age_us: int) -> Callable[[list[bytes]], list[bytes]]:
             if number == ODOMETRY:
                 payload = codec.frames(raw)[0].payload
                 t_ms = (int.from_bytes(payload[:8], "little") + age_us) // 1000
-                told = struct.pack("<I", t_ms) + payload[20:36] + payload[48:60] + bytes(16)
-                out.append(encoder.hot(ATTITUDE_QUATERNION, told))
+                for older_ms in (0, older_us // 1000) if older_us else (0,):
+                    told = struct.pack("<I", t_ms - older_ms) + payload[20:36] + payload[48:60] + bytes(16)
+                    out.append(encoder.hot(ATTITUDE_QUATERNION, told))
         count[0] += len(out)
         return [numbered(raw, count[0] - len(out) + i) for i, raw in enumerate(out)]
 
@@ -469,9 +473,9 @@ def attitudes_behind(age_us: int) -> Callable[[list[bytes]], list[bytes]]:
 
 
 @pytest.mark.numba
-@pytest.mark.parametrize("age_us", [0, 15_000])
+@pytest.mark.parametrize(("age_us", "older_us"), [(0, 0), (15_000, 0), (15_000, 4_000)])
 def test_states_with_attitudes_behind_them_are_answered_by_reflex(
-    make_wire: Callable[..., VirtualWire], age_us: int, monkeypatch: pytest.MonkeyPatch
+    make_wire: Callable[..., VirtualWire], age_us: int, older_us: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same setpoints as the usual way gives, and the same figures."""
     flight, flown, by_reflex = hovering(1.0), [], [0]
@@ -486,11 +490,11 @@ def test_states_with_attitudes_behind_them_are_answered_by_reflex(
         monkeypatch.setattr(FlightLoop, "_answer_at_once", way)
         stage = make_wire(((0.0, 0.0, -20.0), 0.0))
         record = FlightRecord(2000, PHASE_NAMES)
-        with QuickWire(stage, attitudes_behind(age_us)) as wire:
+        with QuickWire(stage, attitudes_behind(age_us, older_us)) as wire:
             outcome = FlightLoop(flight, of_flight(flight), wire, record, kernels("numba")).run()
         assert outcome.cause is Cause.COMPLETED, outcome.sentence
         setpoints = [(t, m.to_dict()) for t, m in stage.setpoints(-math.inf)]
-        flown.append((setpoints, record.rows.tobytes(), outcome.vehicle, str(wire.counters)))
+        flown.append((setpoints, record.rows.tobytes(), outcome.vehicle, str(wire.counters), outcome.rejected_states))
     assert by_reflex[0] > 0.4 * len(record)  # at the others something else came before the state
     assert flown[0] == flown[1]
     assert (flown[0][2]["refreshed_states"] > 0.8 * len(record)) == (age_us > 0)

@@ -1,8 +1,12 @@
 """A stream of attitudes is given up where none is newer than the state it comes with."""
 
+from typing import Any
+
 import pytest
 
-from companion.flight.streams import STATES_JUDGED, Attitudes
+from companion.flight.streams import ATTITUDE_TARGET, STATES_JUDGED, Attitudes, Streams
+from companion.link.codec import COMMAND_LONG_LAYOUT
+from companion.link.operations import DEFAULT_INTERVAL, STOP_MESSAGE
 
 
 def judged(attitudes: Attitudes, age_us: int, behind_ns: int, states: int = STATES_JUDGED + 10) -> list[int]:
@@ -54,3 +58,34 @@ def test_a_few_accidents_do_not_keep_the_stream() -> None:
         attitudes.on_attitude(10_000 * i + (5_000 if i % 20 == 0 else 0), 10_000_000 * i - 1000)
         said.append(attitudes.waste(10_000 * i, 10_000_000 * i))
     assert sum(said) == 1
+
+
+class Asked:
+    """Requests to an autopilot, and a wire, that only remember."""
+
+    def __init__(self) -> None:
+        self.intervals_us: dict[int, int] = {}
+
+    def set_message_interval(self, msgid: int, interval_us: int, now_s: float) -> None:
+        self.intervals_us[msgid] = interval_us
+
+    def send(self, msgid: int, payload: bytes) -> bool:
+        number, interval_us, *_ = COMMAND_LONG_LAYOUT.unpack(payload)
+        self.intervals_us[int(number)] = int(interval_us)
+        return True
+
+
+@pytest.mark.parametrize("exclusive", [True, False])
+@pytest.mark.parametrize("paced", [True, False])
+def test_all_that_was_left_out_is_there_for_the_next_flight(exclusive: bool, paced: bool) -> None:
+    """At its end in real time, whose requests may be lost; in any case at the beginning, as far as it needs them."""
+    asked: Any = Asked()
+    first = Streams(exclusive=exclusive, paced=paced, predicts=True)
+    first.on_engaged(asked, 1.0)
+    assert (asked.intervals_us == {ATTITUDE_TARGET: STOP_MESSAGE}) == (exclusive or paced)
+    following = Streams(exclusive=exclusive, paced=paced, predicts=True).intervals_us
+    assert following.get(ATTITUDE_TARGET) == (DEFAULT_INTERVAL if exclusive or paced else None)
+    asked.intervals_us |= first.intervals_us
+    first.leave(asked, 1, 1)
+    if exclusive and not paced:
+        assert set(asked.intervals_us.values()) == {DEFAULT_INTERVAL}
