@@ -32,6 +32,8 @@ COMMANDS = 10
 """Where they begin: stamp of their state [s], roll and pitch rate [rad/s]."""
 COMMAND = 3
 SIZE = COMMANDS + 2 * _COMMANDS_MAX * COMMAND
+_ACTED_MAX = 32 * COMMAND
+"""So much room at the front is used again: what is in use stays small."""
 
 
 class Following:
@@ -110,7 +112,7 @@ def follow(
     n[ROLL], n[PITCH] = (roll, pitch) if n[ACTS] < 0.5 else model(n, t_s)
     n[LAST] = t_s
     begin, end = int(n[BEGIN]), int(n[END])
-    if end + COMMAND > SIZE:  # what is under way moves to the front again
+    if end + COMMAND > SIZE or begin >= COMMANDS + _ACTED_MAX:  # what is under way moves to the front again
         for i in range(end - begin):
             n[COMMANDS + i] = n[begin + i]
         begin, end = COMMANDS, COMMANDS + end - begin
