@@ -174,8 +174,8 @@ class Peer:
             over = self._wait_for_answer()
         else:
             self._wait_for_time()
-        if self._truth_log is not None and over:
-            self._truth_log.add(text)
+        if over:
+            self._log_row(text)
 
     def _advance(self) -> str:
         """Move by one state period and send; gives the state's row for the truth file, if there is one."""

@@ -10,7 +10,7 @@ from companion.link import codec
 from companion.link.framing import Frame
 from companion.link.wire import Wire
 
-AUTOPILOT_COMPONENT = 1
+AUTOPILOT_COMPONENT = codec.AUTOPILOT_COMPONENT
 WAIT_S = 0.1
 HEARTBEAT_INTERVAL_NS = 1_000_000_000
 PEER_PATIENCE_NS = 2_000_000_000

@@ -76,6 +76,7 @@ CURRENT_MODE = 436
 EXTENDED_SYS_STATE = 245
 HOME_POSITION = 242
 ATTITUDE_TARGET = 83
+"""Tells the thrust of the autopilot's own hover."""
 
 MESSAGE_RATES_HZ = {CURRENT_MODE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 5.0, ESTIMATOR_STATUS: 5.0}
 """Beside ODOMETRY, which is asked for at the vehicle file's rate."""

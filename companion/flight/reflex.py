@@ -26,10 +26,9 @@ from companion.control.types import Quat, Vec3, new_record
 from companion.control.vectors import rotate_to_inertial
 from companion.flight import fused
 from companion.flight.fused import flight_step
-from companion.link.codec import MAV_FRAME_LOCAL_NED, ODOMETRY, SET_ATTITUDE_TARGET, TIMESYNC
+from companion.link.codec import AUTOPILOT_COMPONENT, MAV_FRAME_LOCAL_NED, ODOMETRY, SET_ATTITUDE_TARGET, TIMESYNC
 from companion.link.direct import (
     AT,
-    AUTOPILOT,
     CHILD_FRAME_ID,
     FRAME_ID,
     ODOMETRY_EXTRA,
@@ -59,6 +58,7 @@ from companion.link.telemetry import (
     RATE_MAX_RAD_S,
     SPEED_MAX_M_S,
     VehicleState,
+    within,
 )
 from companion.link.timesync import PACED_INTERVAL_MAX_US
 
@@ -74,7 +74,7 @@ DATAGRAM = 0
 OUTPUT = 256
 """What is sent, its first byte at `direct.AT`."""
 GIVEN = OUTPUT + 16
-"""Integers, in the order of `Given`."""
+"""Integers."""
 (
     BYTES,  # of the datagram
     IN_SEQ,  # the sequence number that is due from the autopilot
@@ -191,7 +191,7 @@ def _sound_state(f: MutableSequence[float], floats: Sequence[float], child: int)
     length = math.sqrt(a * a + b * b + c * c + e * e)
     if not QUATERNION_LENGTH[0] <= length <= QUATERNION_LENGTH[1]:
         return False
-    if not (_within(p, POSITION_MAX_M) and _within(v, SPEED_MAX_M_S) and _within(w, RATE_MAX_RAD_S)):
+    if not (within(p, POSITION_MAX_M) and within(v, SPEED_MAX_M_S) and within(w, RATE_MAX_RAD_S)):
         return False
     q = (a / length, b / length, c / length, e / length)
     if child == MAV_FRAME_BODY_FRD:
@@ -201,11 +201,6 @@ def _sound_state(f: MutableSequence[float], floats: Sequence[float], child: int)
     for k in range(4):
         f[SEEN + 6 + k] = q[k]
     return True
-
-
-def _within(a: tuple[float, float, float], bound: float) -> bool:
-    x, y, z = a
-    return -bound <= x <= bound and -bound <= y <= bound and -bound <= z <= bound
 
 
 def _goes_on(f: Sequence[float], m: MutableSequence[float], stamp_s: float) -> bool:
@@ -227,13 +222,13 @@ def _remember(f: MutableSequence[float], m: MutableSequence[float], floats: Sequ
 def _sendable(m: Sequence[float]) -> bool:
     """The last check before the vehicle, as `setpoint.check` makes it."""
     rates = (m[_RATES], m[_RATES + 1], m[_RATES + 2])
-    return 0.0 <= m[fused.SHARE] <= 1.0 and _within(rates, RATE_BOUND_RAD_S)
+    return 0.0 <= m[fused.SHARE] <= 1.0 and within(rates, RATE_BOUND_RAD_S)
 
 
 def _write(z: Any, m: Sequence[float], system: int) -> None:
     """Frames the setpoint, and in lockstep the answer behind it."""
     o, floats = z[OUTPUT:GIVEN].view(np.uint8), z[OUTPUT:GIVEN].view(np.float32)
-    own, target, seq = (z[OWN_SYSTEM], z[OWN_COMPONENT]), (system, AUTOPILOT), z[OUT_SEQ]
+    own, target, seq = (z[OWN_SYSTEM], z[OWN_COMPONENT]), (system, AUTOPILOT_COMPONENT), z[OUT_SEQ]
     rates = (m[_RATES], m[_RATES + 1], m[_RATES + 2])
     write_rates(o, floats, z[STAMP_US] // 1000 & _UINT32, rates, m[fused.SHARE], target, MASK_RATES)
     length, message, extra = SET_ATTITUDE_TARGET_BYTES, SET_ATTITUDE_TARGET, SET_ATTITUDE_TARGET_EXTRA

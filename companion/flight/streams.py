@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 from typing import Final
 
+from companion.flight.preflight import ATTITUDE_TARGET
 from companion.link import codec
 from companion.link.operations import DEFAULT_INTERVAL, STOP_MESSAGE, Command, Operations
 from companion.link.wire import Wire
@@ -19,8 +20,6 @@ from companion.link.wire import Wire
 NOT_NEEDED: Final = (24, 30, 32, 33, 36, 62, 65, 74, 85, 87, 105, 141)
 """GPS_RAW_INT, ATTITUDE, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, NAV_CONTROLLER_OUTPUT, RC_CHANNELS,
 VFR_HUD, POSITION_TARGET_LOCAL_NED, POSITION_TARGET_GLOBAL_INT, HIGHRES_IMU, ALTITUDE."""
-ATTITUDE_TARGET: Final = 83
-"""Tells the thrust of the autopilot's own hover."""
 ATTITUDE_INTERVAL_US: Final = 3_200
 """PX4 has an attitude at each of its 4 ms."""
 STATES_JUDGED: Final = 300

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import MutableSequence, Sequence
 from typing import Final
 
+from companion.link.codec import AUTOPILOT_COMPONENT
 from companion.link.framing import MAGIC_V2
 
 AT: Final = 6
@@ -19,8 +20,6 @@ AT: Final = 6
 PAYLOAD: Final = AT + 10
 ODOMETRY_EXTRA, TIMESYNC_EXTRA, SET_ATTITUDE_TARGET_EXTRA = 91, 34, 49
 """The seeds of their checksums."""
-AUTOPILOT = 1
-"""Component id of the autopilot."""
 _HEADER = 10
 _CHECKSUM = 2
 
@@ -68,7 +67,7 @@ def frame_end(d: Sequence[int], at: int, end: int, system: int, msgid: int, extr
     if end - at < _HEADER + _CHECKSUM or d[at] != MAGIC_V2 or d[at + 2] != 0:
         return 0
     stop = at + _HEADER + d[at + 1]
-    if stop + _CHECKSUM > end or d[at + 5] != system or d[at + 6] != AUTOPILOT:
+    if stop + _CHECKSUM > end or d[at + 5] != system or d[at + 6] != AUTOPILOT_COMPONENT:
         return 0
     if d[at + 7] != msgid & 0xFF or d[at + 8] != msgid >> 8 or d[at + 9] != 0:
         return 0

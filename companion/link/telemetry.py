@@ -158,9 +158,9 @@ class Telemetry:
         q = _unit(attitude)
         if isinstance(q, StateRejection):
             return q
-        if not (_within(p, POSITION_MAX_M) and _within(v, SPEED_MAX_M_S)):
+        if not (within(p, POSITION_MAX_M) and within(v, SPEED_MAX_M_S)):
             return _unusable(p, v)
-        if not _within(w, RATE_MAX_RAD_S):
+        if not within(w, RATE_MAX_RAD_S):
             return _unusable(w)
         if child == MAV_FRAME_BODY_FRD:
             v = rotate_to_inertial(q, v)
@@ -222,7 +222,7 @@ class Telemetry:
         q = _unit(message.q)
         if isinstance(q, StateRejection):
             return q
-        if not _within(message.w, RATE_MAX_RAD_S):
+        if not within(message.w, RATE_MAX_RAD_S):
             return _unusable(message.w)
         return AttitudeSample(t_us, q, message.w)
 
@@ -235,7 +235,7 @@ class Telemetry:
         self._attitude_us = -1
 
 
-def _within(a: Vec3, bound: float) -> bool:
+def within(a: Vec3, bound: float) -> bool:
     """Whether every component is within +-bound; NaN is not."""
     x, y, z = a
     return -bound <= x <= bound and -bound <= y <= bound and -bound <= z <= bound

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Final
 
-from companion.link.codec import HEARTBEAT, encode_heartbeat, message_formats
+from companion.link.codec import AUTOPILOT_COMPONENT, HEARTBEAT, encode_heartbeat, message_formats
 from companion.link.framing import (
     MAGIC_V2,
     SIGNED,
@@ -39,7 +39,6 @@ TAP_IN: Final = 0
 TAP_OUT: Final = 3  # the numbers that a traffic log (.tlog) has for the directions
 
 COMPANION_COMPONENT: Final = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
-_AUTOPILOT_COMPONENT: Final = 1
 _READS_MAX = 256
 _MSGID = slice(7, 10)
 _V2 = bytes((MAGIC_V2,))
@@ -295,7 +294,7 @@ class Wire:
             return False
         if self.component_id != COMPANION_COMPONENT:
             return True
-        autopilot = frame.msgid == HEARTBEAT and frame.compid == _AUTOPILOT_COMPONENT
+        autopilot = frame.msgid == HEARTBEAT and frame.compid == AUTOPILOT_COMPONENT
         return autopilot and self.only_system in {None, frame.sysid}
 
     def _greet(self, address: Address | None, wall_ns: int) -> None:

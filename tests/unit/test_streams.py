@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from companion.flight.streams import ATTITUDE_TARGET, STATES_JUDGED, Attitudes, Streams
+from companion.flight.preflight import ATTITUDE_TARGET
+from companion.flight.streams import STATES_JUDGED, Attitudes, Streams
 from companion.link.codec import COMMAND_LONG_LAYOUT
 from companion.link.operations import DEFAULT_INTERVAL, STOP_MESSAGE
 
