@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import builtins
 import dis
+import functools
 import hashlib
 import importlib.util
 import os
@@ -21,6 +22,7 @@ from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
 
+from companion.control.types import new_record
 from companion.errors import InputError
 
 ENGINES = ("auto", "python", "numba")
@@ -85,6 +87,22 @@ def compile_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return twin
 
 
+def compile_for(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """Return the compiled twin of a plain function for arguments of the types of these alone, compiled or loaded now.
+
+    It is called without a look at what it gets, which would take longer than a short kernel: an array of other numbers
+    would be read as if it were none.
+    """
+    import numba
+
+    twin: Any = compile_kernel(function)
+    type_of: Any = numba.typeof
+    types = tuple(type_of(argument) for argument in arguments)
+    twin.compile(types)
+    entry: Callable[..., Any] = twin.get_overload(types)
+    return entry
+
+
 def _twin(function: FunctionType, callers: tuple[FunctionType, ...]) -> Any:
     """Return the compiled copy of a function, its callees first; `callers` is the path to it, to find recursion."""
     if function in _compiled:
@@ -104,9 +122,23 @@ def _twin(function: FunctionType, callers: tuple[FunctionType, ...]) -> Any:
     return twin
 
 
+@functools.cache
+def _teach_records() -> None:
+    """Lets compiled code make records with `types.new_record`."""
+    from numba import types
+    from numba.extending import overload
+
+    @overload(new_record, strict=False)
+    def make(kind: Any, fields: Any) -> Any:
+        if isinstance(kind, types.NamedTupleClass):
+            return lambda kind, fields: kind(*fields)
+        return None
+
+
 def _compile(function: FunctionType, digest: str) -> Any:
     import numba
 
+    _teach_records()
     config: Any = numba.config
     folder = _cache_folder(str(config.CACHE_DIR), digest)
     if folder is None:

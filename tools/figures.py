@@ -31,7 +31,8 @@ from companion import accelerate
 from companion.config import load_flight
 from companion.control.types import State
 from companion.flight.course import Course, Timed
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.engines import kernels
+from companion.flight.tracker import Tracker
 from companion.ground.exchange import OWN_COMPONENT, OWN_SYSTEM
 from companion.ground.ftp import crc32
 from companion.ground.upload import Files

@@ -19,10 +19,10 @@ import tomlkit
 from companion.config import Flight, build_flight, find, read_toml
 from companion.flight import loop as loop_module
 from companion.flight.bundled import free_udp_port
+from companion.flight.engines import Kernels, kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Outcome, Phase
 from companion.flight.process import warm_up
-from companion.flight.tracker import Kernels, kernels
 from companion.link.framing import Frame
 from companion.link.transport import open_transport
 from companion.link.wire import Wire

@@ -21,7 +21,7 @@ from typing import Any
 from companion.campaign.starved import Starvation, Starved, fly_starved
 from companion.config import Flight, build_flight, find, read_toml
 from companion.flight.adaptation import slower
-from companion.flight.tracker import kernels
+from companion.flight.engines import kernels
 from companion.trajectory.load import embedded, of_flight
 
 STARVATIONS = {

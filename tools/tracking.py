@@ -18,7 +18,7 @@ from typing import Any
 from companion.campaign.simulate import fly_sampled, simulated_vehicle
 from companion.config import Flight, build_flight, find, read_toml
 from companion.errors import RefusedError
-from companion.flight.tracker import kernels
+from companion.flight.engines import kernels
 from companion.trajectory.load import embedded, of_flight
 
 SPEEDS = (1.0, 2.5, 3.5)

@@ -12,13 +12,14 @@ from companion.campaign.simulate import Trace, fly_sampled
 from companion.config import Flight, SimulatedWorld, Start, Vehicle
 from companion.control import flat
 from companion.control.certificate import ThrustBounds, thrust_bounds
-from companion.control.law import errors, lyapunov, torque
+from companion.control.heading import HeadingState
+from companion.control.law import ControllerState, evaluate, lyapunov, torque
 from companion.control.types import GRAVITY_M_S2, State, Vec3
 from companion.control.vectors import norm
 from companion.errors import RefusedError
+from companion.flight.engines import Kernels
 from companion.flight.envelope import Envelope
 from companion.flight.guards import Guard, disturbance_step
-from companion.flight.tracker import Kernels
 from companion.frames import degrees, quat_from_yaw, radians, tilt_from_quat
 from companion.record.columns import LIMIT_RATE_ROLL_PITCH, LIMIT_RATE_YAW, LIMIT_THRUST_MAX, LIMIT_THRUST_MIN
 from companion.trajectory.anchored import Trajectory, anchored
@@ -174,7 +175,9 @@ def bounds(flight: Flight, trajectory: Trajectory) -> ThrustBounds:
         first = first._replace(p=position, v=(0.0, 0.0, 0.0), a=(0.0, 0.0, 0.0), j=(0.0, 0.0, 0.0))
     zero = (0.0, 0.0, 0.0)
     state = State(position, zero, quat_from_yaw(radians(start.yaw_deg)), zero)
-    e = errors(state, first, model.mass * GRAVITY_M_S2, 0.0, zero, gains, model)
+    ahead = HeadingState((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), False)
+    hover = ControllerState(model.mass * GRAVITY_M_S2, 0.0, zero, ahead, zero)
+    e = evaluate(state, first, hover, parameters, True, 0.0).errors
     return thrust_bounds(
         gains, model.mass, model.gravity, q2_max, vehicle.limits.disturbance_max_m_s2, lyapunov(e, gains.p_max), 0.0
     )

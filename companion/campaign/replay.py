@@ -24,8 +24,9 @@ from companion.errors import InputError
 from companion.flight.adaptation import adapted
 from companion.flight.controller import controller_of
 from companion.flight.course import ZERO, Course, Timed
+from companion.flight.engines import Kernels
 from companion.flight.phases import Engagement
-from companion.flight.tracker import Kernels, Tracker
+from companion.flight.tracker import Tracker
 from companion.record.flight_record import FlightRecord
 from companion.record.flight_source import FlightSource, read_source
 from companion.trajectory.load import of_flight

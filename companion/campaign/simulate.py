@@ -26,9 +26,10 @@ from companion.control.output import ActuatorSetpoint, AttitudeSetpoint, Positio
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.errors import InputError, RefusedError
 from companion.flight.course import Course, Timed
+from companion.flight.engines import Kernels
 from companion.flight.phases import PHASE_INDEX, PHASE_NAMES, Phase
 from companion.flight.rows import StepTiming, control_row
-from companion.flight.tracker import Kernels, Tracker, TrackerStep
+from companion.flight.tracker import Tracker, TrackerStep
 from companion.frames import quat_from_yaw, radians
 from companion.link.telemetry import VehicleState
 from companion.record.flight_record import FlightRecord

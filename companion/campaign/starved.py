@@ -20,9 +20,10 @@ from companion.control import flat
 from companion.control.output import RateSetpoint, thrust_fraction
 from companion.control.types import GRAVITY_M_S2, State
 from companion.flight.course import Course, Timed
+from companion.flight.engines import Kernels
 from companion.flight.following import Following
 from companion.flight.guards import Guards, Response
-from companion.flight.tracker import Kernels, Tracker
+from companion.flight.tracker import Tracker
 from companion.frames import quat_from_yaw, tilt_from_quat
 from companion.trajectory.anchored import Trajectory
 from sim_link import inner_loops

@@ -33,9 +33,9 @@ def run(
     from companion.campaign.predict import Extreme, bounds, gate_prediction
     from companion.control.certificate import certify, disturbance_overcome
     from companion.errors import CompanionError, ExitCode
+    from companion.flight.engines import kernels
     from companion.flight.loop_margins import loop_margins, timing
     from companion.flight.preflight import gate_gains, gate_reference
-    from companion.flight.tracker import kernels
     from companion.trajectory.load import of_flight
 
     flight = _flight(config, trajectory_changes(trajectory, frame), start, time_scale, output)

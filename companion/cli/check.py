@@ -173,7 +173,7 @@ def _check(
 
 def _predicted(flight: Any, trajectory: Trajectory) -> dict[str, Any]:
     from companion.campaign.predict import PREDICTED_S, Extreme, gate_prediction
-    from companion.flight.tracker import kernels
+    from companion.flight.engines import kernels
 
     found: Prediction = gate_prediction(flight, trajectory, kernels("python"))
     values = found._asdict().items()

@@ -54,10 +54,10 @@ def run(
 ) -> None:
     """Lets the gates judge a connected vehicle."""
     from companion.errors import InputError
+    from companion.flight.engines import kernels
     from companion.flight.loop import FlightLoop
     from companion.flight.phases import PHASE_NAMES
     from companion.flight.preflight import gains_finding
-    from companion.flight.tracker import kernels
     from companion.link.vehicle_link import VehicleLink
     from companion.record.flight_record import FlightRecord
     from companion.trajectory.load import of_flight

@@ -37,7 +37,7 @@ def run(
 
     from companion.campaign.replay import configuration_of, replay
     from companion.config import build_flight
-    from companion.flight.tracker import kernels
+    from companion.flight.engines import kernels
     from companion.record.flight_source import read_source
 
     source = read_source(flight)

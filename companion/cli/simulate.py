@@ -57,8 +57,8 @@ def run(
     from companion.campaign.whole import simulated, steps_per_state
     from companion.config import load_flight
     from companion.errors import ExitCode, InputError
+    from companion.flight.engines import kernels
     from companion.flight.preflight import gate_gains, gate_reference
-    from companion.flight.tracker import kernels
     from companion.record.summary import met
     from companion.trajectory.load import embedded, of_flight
 

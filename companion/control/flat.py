@@ -1,7 +1,7 @@
 """One whole control step, prediction included, on flat arrays: what the compiled engine calls.
 
 Nested tuples are expensive to hand to compiled code (some 30 us for a step), a few arrays of floats are not. The
-function is a kernel like the others and calls the very same `model.advance` and `law.step`; with lists instead of
+function is a kernel like the others and calls the very same `model.through` and `law.step`; with lists instead of
 arrays it runs as plain Python.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import MutableSequence, Sequence
 
 from companion.control.heading import HeadingState
-from companion.control.history import PIECE
 from companion.control.law import (
     Command,
     ControllerState,
@@ -22,7 +21,7 @@ from companion.control.law import (
     lyapunov,
     step,
 )
-from companion.control.model import Factors, advance
+from companion.control.model import Factors, through
 from companion.control.types import Reference, State
 
 # where things stand in the input, behind the state's 13 numbers
@@ -114,11 +113,7 @@ def control_step(x: MutableSequence[float], c: Sequence[float], y: MutableSequen
     model = Model(c[10], c[11], c[12], (c[13], c[14], c[15]), (c[16], c[17], c[18]), c[19])
     limits = Limits(c[20], c[21], (c[22], c[23], c[24]), c[25], c[26], c[27])
     lags = (c[28], c[29], c[30], c[31], c[32], c[33], c[34], c[35])
-    thrust = x[THRUST_NOW]
-    for i in range(int(x[COUNT])):
-        j = PIECES + PIECE * i
-        rates = (x[j + 1], x[j + 2], x[j + 3])
-        state, thrust = advance(state, thrust, rates, x[j], b_hat, (c[10], c[11], c[12]), lags, x[j + 4])
+    state, _ = through(state, x[THRUST_NOW], x, PIECES, int(x[COUNT]), b_hat, (c[10], c[11], c[12]), lags)
     command, after, out = step(state, ref, controller, Parameters(gains, model, limits), x[FROZEN] > 0.5, x[DT])
     if x[INTEGRATE] < 0.5:
         after = controller

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from companion.control.types import Reference, State, Vec3
+from companion.control.types import Reference, State, Vec3, new_record
 from companion.control.vectors import cross, dot, norm, scale
 
 DAMPING = 0
@@ -20,6 +20,8 @@ COMMANDED = 2
 
 FORCE_MIN_M_S2 = 0.5
 """|F|/m below which the thrust direction means nothing: the heading is damped and its memory kept."""
+ACROSS_MIN = 1e-6
+"""|r3d x f| below which there is no direction either."""
 
 
 class HeadingState(NamedTuple):
@@ -34,80 +36,50 @@ class HeadingState(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """The desired y axis and the yaw rate that goes with it."""
+    """The desired axes and the rates that go with them."""
 
     r1d: Vec3
     r2d: Vec3
-    r2d_rate: Vec3
+    w1d: float
+    """Desired roll rate, with which r2d leaves the plane at right angles to r3d: r2d' = w1d r3d - w3d r1d [rad/s]."""
     w3d: float
     """Desired yaw rate [rad/s]."""
     w3d_rate: float
     """Its derivative [rad/s^2]."""
 
 
-def unit_derivatives(f: Vec3, f1: Vec3, f2: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-    """u = f/|f| with its first two derivatives, from those of f; f must not be zero."""
-    a, b, c = f
-    a1, b1, c1 = f1
-    a2, b2, c2 = f2
-    k = 1.0 / math.sqrt(a * a + b * b + c * c)
-    x, y, z = k * a, k * b, k * c
-    n1 = x * a1 + y * b1 + z * c1
-    x1, y1, z1 = k * (a1 - n1 * x), k * (b1 - n1 * y), k * (c1 - n1 * z)
-    n2 = x * a2 + y * b2 + z * c2 + x1 * a1 + y1 * b1 + z1 * c1
-    n1 = 2.0 * n1
-    return (
-        (x, y, z),
-        (x1, y1, z1),
-        (k * (a2 - n2 * x - n1 * x1), k * (b2 - n2 * y - n1 * y1), k * (c2 - n2 * z - n1 * z1)),
-    )
-
-
-def unit_rate(f: Vec3, f1: Vec3) -> tuple[Vec3, Vec3]:
-    """u = f/|f| with its first derivative; f must not be zero."""
-    a, b, c = f
-    a1, b1, c1 = f1
-    k = 1.0 / math.sqrt(a * a + b * b + c * c)
-    x, y, z = k * a, k * b, k * c
-    n = x * a1 + y * b1 + z * c1
-    return (x, y, z), (k * (a1 - n * x), k * (b1 - n * y), k * (c1 - n * z))
-
-
-def desired_frame(force: tuple[Vec3, Vec3, Vec3], r3d: tuple[Vec3, Vec3], f: Vec3, f1: Vec3, f2: Vec3) -> Frame:
-    """(40) and the yaw rate w3d = -r1d . r2d' that follows from R_d' = R_d S(w_d), with its derivative.
+def desired_frame(
+    force: tuple[Vec3, Vec3, Vec3], size: float, r3d: Vec3, forward: tuple[Vec3, Vec3, Vec3], across: Vec3
+) -> Frame:
+    """(40) and the yaw rate w3d with its derivative that follow from R_d' = R_d S(w_d) (docs/law.md section 5).
 
     Args:
         force: F/m and its first two derivatives; only their direction counts.
-        r3d: the desired thrust direction F/|F| and its derivative (`unit_rate`).
-        f: forward direction, not parallel to r3d; f1 and f2 its derivatives.
+        size: |F/m|.
+        r3d: the desired thrust direction F/|F|.
+        forward: f and its first two derivatives; f is not parallel to r3d.
+        across: r3d x f.
     """
-    (ax, ay, az), (ax1, ay1, az1), (ax2, ay2, az2) = force
-    fx, fy, fz = f
-    fx1, fy1, fz1 = f1
-    fx2, fy2, fz2 = f2
-    # r2d has the direction of F x f. With its derivatives, written out: this is the longest part of a control step
-    q = (ay * fz - az * fy, az * fx - ax * fz, ax * fy - ay * fx)
-    q1 = (
-        ay1 * fz - az1 * fy + ay * fz1 - az * fy1,
-        az1 * fx - ax1 * fz + az * fx1 - ax * fz1,
-        ax1 * fy - ay1 * fx + ax * fy1 - ay * fx1,
-    )
-    q2 = (
-        ay2 * fz - az2 * fy + 2.0 * (ay1 * fz1 - az1 * fy1) + ay * fz2 - az * fy2,
-        az2 * fx - ax2 * fz + 2.0 * (az1 * fx1 - ax1 * fz1) + az * fx2 - ax * fz2,
-        ax2 * fy - ay2 * fx + 2.0 * (ax1 * fy1 - ay1 * fx1) + ax * fy2 - ay * fx2,
-    )
-    r2d, r2d_rate, r2d_acceleration = unit_derivatives(q, q1, q2)
-    (ux, uy, uz), (ux1, uy1, uz1) = r3d
-    yx, yy, yz = r2d
-    yx1, yy1, yz1 = r2d_rate
-    yx2, yy2, yz2 = r2d_acceleration
-    # r1d = r2d x r3d; of its derivative only r2d x r3d' has a share in r1d' . r2d'
-    xx, xy, xz = yy * uz - yz * uy, yz * ux - yx * uz, yx * uy - yy * ux
-    w3d = -(xx * yx1 + xy * yy1 + xz * yz1)
-    turned = (yy * uz1 - yz * uy1) * yx1 + (yz * ux1 - yx * uz1) * yy1 + (yx * uy1 - yy * ux1) * yz1
-    w3d_rate = -(turned + xx * yx2 + xy * yy2 + xz * yz2)
-    return Frame((xx, xy, xz), r2d, r2d_rate, w3d, w3d_rate)
+    _, (ax, ay, az), (bx, by, bz) = force
+    (fx, fy, fz), (gx, gy, gz), (hx, hy, hz) = forward
+    zx, zy, zz = r3d
+    yx, yy, yz = across
+    f1 = math.sqrt(yx * yx + yy * yy + yz * yz)
+    k = 1.0 / f1
+    yx, yy, yz = k * yx, k * yy, k * yz
+    xx, xy, xz = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
+    # F stays along r3d, f stays in the plane of r1d and r3d: their derivatives' components in the frame give its rates
+    per_size = 1.0 / size
+    growth = per_size * (ax * zx + ay * zy + az * zz)
+    w1 = -per_size * (ax * yx + ay * yy + az * yz)
+    w2 = per_size * (ax * xx + ay * xy + az * xz)
+    f3 = fx * zx + fy * zy + fz * zz
+    w3 = k * (gx * yx + gy * yy + gz * yz + f3 * w1)
+    w1_rate = w3 * w2 - 2.0 * w1 * growth - per_size * (bx * yx + by * yy + bz * yz)
+    g1, g3 = gx * xx + gy * xy + gz * xz, gx * zx + gy * zy + gz * zz
+    h2 = hx * yx + hy * yy + hz * yz
+    w3_rate = k * (h2 + 2.0 * (w1 * g3 - w3 * g1) + w2 * (w3 * f3 + w1 * f1) + w1_rate * f3)
+    return new_record(Frame, ((xx, xy, xz), (yx, yy, yz), w1, w3, w3_rate))
 
 
 def limit_rate(frame: Frame, r3d: Vec3, last: Vec3, rate_max: float, dt_s: float) -> Frame:
@@ -134,37 +106,36 @@ def limit_rate(frame: Frame, r3d: Vec3, last: Vec3, rate_max: float, dt_s: float
     c, s = math.cos(rate * dt_s), math.sin(rate * dt_s)
     r2d = (c * start[0] - s * side[0], c * start[1] - s * side[1], c * start[2] - s * side[2])
     r1d = cross(r2d, r3d)
-    return Frame(r1d, r2d, scale(-rate, r1d), rate, 0.0)
+    return Frame(r1d, r2d, 0.0, rate, 0.0)
 
 
 def forward_direction(
     ref: Reference, r3d: Vec3, memory: HeadingState, kind: int, speed_min: float
-) -> tuple[Vec3, Vec3, Vec3, HeadingState, float]:
-    """The forward direction f with two derivatives, the memory with the hold decision made, and |r3d x f|.
+) -> tuple[tuple[Vec3, Vec3, Vec3], HeadingState, Vec3]:
+    """The forward direction f with two derivatives, the memory with the hold decision made, and r3d x f.
 
     For zero sideslip the hysteresis is on |r3d x p_d'|, not on the speed: a vertical climb has speed and no direction.
     """
     zero = (0.0, 0.0, 0.0)
+    _, v, a, j, _, yaw, n, n2 = ref
     if kind == COMMANDED:
-        c, s = math.cos(ref.yaw), math.sin(ref.yaw)
-        n, n2 = ref.yaw_rate, ref.yaw_acceleration
+        c, s = math.cos(yaw), math.sin(yaw)
         f = (c, s, 0.0)
         f1 = (-n * s, n * c, 0.0)
         f2 = (-n2 * s - n * n * c, n2 * c - n * n * s, 0.0)
-        return f, f1, f2, HeadingState(memory.r2d, memory.forward, False), norm(cross(r3d, f))
-    a, b, c = r3d
-    d, e, g = ref.v
-    x, y, z = b * g - c * e, c * d - a * g, a * e - b * d
-    size = math.sqrt(x * x + y * y + z * z)
-    threshold = 2.0 * speed_min if memory.held else speed_min
-    if size > threshold:
-        if memory.held:
+        return (f, f1, f2), HeadingState(memory.r2d, memory.forward, False), cross(r3d, f)
+    across = cross(r3d, v)
+    x, y, z = across
+    held = memory.held
+    threshold = 2.0 * speed_min if held else speed_min
+    if x * x + y * y + z * z > threshold * threshold:
+        if held:
             memory = HeadingState(memory.r2d, memory.forward, False)
-        return ref.v, ref.a, ref.j, memory, size
+        return (v, a, j), memory, across
     forward = memory.forward
-    if not memory.held:
+    if not held:
         forward = cross(memory.r2d, r3d)
-    return forward, zero, zero, HeadingState(memory.r2d, forward, True), norm(cross(r3d, forward))
+    return (forward, zero, zero), HeadingState(memory.r2d, forward, True), cross(r3d, forward)
 
 
 def heading_torque(
@@ -195,24 +166,31 @@ def heading_torque(
         tau3 [rad/s^2], the memory, and the heading error (body x axis against r1d, about r3d) [rad] or NaN.
     """
     l1, l2, damping = gains
-    _, w2, w3 = state.w
-    x, y, z = force[0]
-    if kind == DAMPING or x * x + y * y + z * z < FORCE_MIN_M_S2 * FORCE_MIN_M_S2:
+    _, _, _, (_, w2, w3) = state
+    (x, y, z), _, _ = force
+    size_sq = x * x + y * y + z * z
+    if kind == DAMPING or size_sq < FORCE_MIN_M_S2 * FORCE_MIN_M_S2:
         return -damping * w3, memory, math.nan
-    r3d = unit_rate(force[0], force[1])
-    f, f1, f2, memory, size = forward_direction(ref, r3d[0], memory, kind, limits[1])
-    if size < 1e-6:
+    size = math.sqrt(size_sq)
+    k = 1.0 / size
+    r3d = (k * x, k * y, k * z)
+    forward, memory, across = forward_direction(ref, r3d, memory, kind, limits[1])
+    x, y, z = across
+    if x * x + y * y + z * z < ACROSS_MIN * ACROSS_MIN:
         return -damping * w3, memory, math.nan
-    frame = desired_frame(force, r3d, f, f1, f2)
+    frame = desired_frame(force, size, r3d, forward, across)
     if dt_s > 0.0:
-        frame = limit_rate(frame, r3d[0], memory.r2d, limits[0], dt_s)
-    r1d, r2d, (a1, b1, c1), w3d, w3d_rate = frame
+        frame = limit_rate(frame, r3d, memory.r2d, limits[0], dt_s)
+    (xx, xy, xz), r2d, w1d, w3d, w3d_rate = frame
     (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = body
-    a, b, c = r2d
-    along = a * r10 + b * r11 + c * r12
+    x, y, z = r2d
+    ahead, along, below = (
+        xx * r10 + xy * r11 + xz * r12,
+        x * r10 + y * r11 + z * r12,
+        r3d[0] * r10 + r3d[1] * r11 + r3d[2] * r12,
+    )
     # d/dt(r2d . r1) = r2d' . r1 + r2d . (w3 r2 - w2 r3)
-    turning = a * (w3 * r20 - w2 * r30) + b * (w3 * r21 - w2 * r31) + c * (w3 * r22 - w2 * r32)
-    along_rate = a1 * r10 + b1 * r11 + c1 * r12 + turning
+    turning = w3 * (x * r20 + y * r21 + z * r22) - w2 * (x * r30 + y * r31 + z * r32)
+    along_rate = w1d * below - w3d * ahead + turning
     tau3 = -l2 * (w3 - w3d + l1 * along) + w3d_rate - l1 * along_rate
-    error = math.atan2(along, r1d[0] * r10 + r1d[1] * r11 + r1d[2] * r12)
-    return tau3, HeadingState(r2d, memory.forward, memory.held), error
+    return tau3, new_record(HeadingState, (r2d, memory.forward, memory.held)), math.atan2(along, ahead)

@@ -2,7 +2,7 @@
 
 A command computed from a state stamped s acts from s + delay until the next one does (docs/law.md section 8, "Delay").
 So between a stamp and its time of effect the commands of the last delay/interval samples act one after the other. Here
-they are remembered with their times, and given as a few pieces that `model.advance` runs through. The thrust that acts
+they are remembered with their times, and given as a few pieces that `model.through` runs through. The thrust that acts
 at the stamp is not measured: it is followed with the same model.
 
 A history is a sequence of CAPACITY floats that its owner allocates once (`flight.prediction`): a list for plain Python,
@@ -15,7 +15,7 @@ import math
 from collections.abc import MutableSequence, Sequence
 from typing import NamedTuple
 
-from companion.control.model import lag_factors, lagged
+from companion.control.model import PIECE, lag_factors, lagged
 from companion.control.types import Quat, State, Vec3
 from companion.control.vectors import quat_exp, quat_multiply, quat_normalise
 
@@ -23,8 +23,6 @@ SHORTEST_S = 1e-6
 """Shorter pieces are rounding errors of the stamps."""
 APART_COSINE = math.cos(0.05)
 """Of half the angle: attitudes further apart than 0.1 rad are of different estimates, with a reset between them."""
-PIECE = 5
-"""Numbers of a piece: mean thrust setpoint [N], mean rate setpoints [rad/s], duration [s]."""
 
 # where things stand in a history
 THRUST = 0
@@ -94,15 +92,17 @@ def follow(h: MutableSequence[float], stamp_s: float) -> None:
     if math.isnan(last_s):
         return
     begin_at, end = int(h[BEGIN]), int(h[END])
-    at_s = max(last_s, h[begin_at])
+    at_s = h[begin_at]
+    at_s = max(at_s, last_s)
     thrust = h[THRUST]
     while True:
         following = begin_at + COMMAND
-        until_s = min(stamp_s, h[following]) if following < end else stamp_s
+        following_s = h[following] if following < end else math.inf
+        until_s = following_s if following_s < stamp_s else stamp_s
         if until_s - at_s > SHORTEST_S:
             thrust = lagged(thrust, h[begin_at + 1], h[LAG], until_s - at_s)[0]
             at_s = until_s
-        if following >= end or h[following] > stamp_s + SHORTEST_S:
+        if following_s > stamp_s + SHORTEST_S:
             break
         begin_at = following
     h[THRUST] = thrust
@@ -125,7 +125,7 @@ def gather(h: MutableSequence[float], stamp_s: float, out: MutableSequence[float
     if count == 0:
         return 0
     length_s = h[LENGTH]
-    k = 1.0 / length_s
+    k, least_s = 1.0 / length_s, SHORTEST_S
     i, end = int(h[BEGIN]), int(h[END])
     at_s, edge_s = stamp_s, stamp_s + length_s
     thrust = x = y = z = 0.0
@@ -134,7 +134,7 @@ def gather(h: MutableSequence[float], stamp_s: float, out: MutableSequence[float
         t, p, q, r = h[i + 1], h[i + 2], h[i + 3], h[i + 4]
         i += COMMAND
         until_s = h[i] if i < end else math.inf
-        while until_s > edge_s - SHORTEST_S:  # the piece ends within this command
+        while until_s > edge_s - least_s:  # the piece ends within this command
             share_s = edge_s - at_s
             out[at] = k * (thrust + share_s * t)
             out[at + 1] = k * (x + share_s * p)

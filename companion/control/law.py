@@ -1,9 +1,9 @@
 """The adaptive backstepping law with thrust by dynamic extension (sections I-IV of the paper), as pure functions.
 
-Read it top down: `errors` (8) (25) (30) (15), `estimator_rate` (33) with its projection, `evaluate` (19) (34) (20)
-which gives the derivatives of the controller's state and the angular acceleration, and `step`, which integrates those
-derivatives over one sample and limits them. `evaluate` is the continuous form: an ODE integrator can call it. `step`
-calls the same function: there is one set of equations.
+Read it top down: `evaluate` has the errors (8) (25) (30) (15), the estimator (33) and (19) (34) (20), and gives the
+derivatives of the controller's state and the angular acceleration; `step` integrates those derivatives over one sample
+and limits them. `evaluate` is the continuous form: an ODE integrator can call it. `step` calls the same function: there
+is one set of equations.
 
 The drag D is part of the model: q2, q3, q4 stand wherever the paper has p_d'', p_d''', p_d''''. What the print gets
 wrong is listed in docs/law.md. All functions are kernels (see `companion.accelerate`): plain Python, or compiled from
@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from companion.control.heading import HeadingState, heading_torque
-from companion.control.types import Quat, Reference, State, Vec3
+from companion.control.heading import DAMPING, HeadingState, heading_torque
+from companion.control.types import Quat, Reference, State, Vec3, new_record
 from companion.control.vectors import axes, cross, norm
 
 LIMIT_THRUST_MIN = 1
@@ -157,144 +157,39 @@ class Parameters(NamedTuple):
     limits: Limits
 
 
-def errors(
-    state: State, ref: Reference, thrust: float, thrust_rate: float, b_hat: Vec3, gains: Gains, model: Model
-) -> Errors:
-    """The errors e1 to e4 of equations (8), (25), (30), (15), and sigma(e1) of (26)."""
-    k1 = gains.k1
-    per_k1 = 1.0 / k1
-    c0 = per_k1 * per_k1 / gains.k2
-    c1 = c0 / (k1 * gains.k2 + gains.k3)
-    (p0, p1, p2), (v0, v1, v2), q, (w1, w2, _) = state
-    (pd0, pd1, pd2), (vd0, vd1, vd2), (ad0, ad1, ad2), (jd0, jd1, jd2), _, _, _, _ = ref
-    (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = axes(q)
-    b0, b1, b2 = b_hat
-    t_m = thrust / model.mass
-    td_m = thrust_rate / model.mass
-    d = model.drag
-
-    x, y, z = p0 - pd0, p1 - pd1, p2 - pd2
-    size = math.sqrt(x * x + y * y + z * z)
-    bound = gains.p_max / size if size > gains.p_max else 1.0
-    s0, s1, s2 = bound * x, bound * y, bound * z
-
-    e20, e21, e22 = s0 + per_k1 * (v0 - vd0), s1 + per_k1 * (v1 - vd1), s2 + per_k1 * (v2 - vd2)
-    # a = g u3 - (T/m) r3 + b_hat - q2
-    e30 = e20 + c0 * (b0 - t_m * r30 - ad0 - d * vd0)
-    e31 = e21 + c0 * (b1 - t_m * r31 - ad1 - d * vd1)
-    e32 = e22 + c0 * (b2 - t_m * r32 - ad2 - d * vd2 + model.gravity)
-    # j = -(T'/m) r3 - (T/m) R S(w) u3 - q3, with R S(w) u3 = w2 r1 - w1 r2
-    f1, f2 = -t_m * w2, t_m * w1
-    e40 = e30 + c1 * (f1 * r10 + f2 * r20 - td_m * r30 - jd0 - d * ad0)
-    e41 = e31 + c1 * (f1 * r11 + f2 * r21 - td_m * r31 - jd1 - d * ad1)
-    e42 = e32 + c1 * (f1 * r12 + f2 * r22 - td_m * r32 - jd2 - d * ad2)
-    return Errors((x, y, z), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), (s0, s1, s2))
-
-
-def estimator_rate(e: Errors, b_hat: Vec3, gamma: float, bound: float) -> Vec3:
-    """b_hat' = Gamma (e2 + e3 + e4) (33), projected so that |b_hat| stays within `bound`.
+def projected(free: Vec3, b_hat: Vec3, bound: float) -> Vec3:
+    """b_hat' (33), projected so that |b_hat| stays within `bound`.
 
     In the outer PROJECTION_LAYER of the ball the outward part fades out smoothly. As long as the true value lies inside
     that layer (|b/m| <= 0.9 B), the projection only adds a non-positive term to V'.
-    """
-    _, (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
-    b0, b1, b2 = b_hat
-    x, y, z = gamma * (e20 + e30 + e40), gamma * (e21 + e31 + e41), gamma * (e22 + e32 + e42)
-    size_sq = b0 * b0 + b1 * b1 + b2 * b2
-    inner = (1.0 - PROJECTION_LAYER) * bound
-    outward = b0 * x + b1 * y + b2 * z
-    if size_sq > inner * inner and outward > 0.0:
-        share = min(1.0, (size_sq - inner * inner) / (bound * bound - inner * inner))
-        cut = share * outward / size_sq
-        return (x - cut * b0, y - cut * b1, z - cut * b2)
-    return (x, y, z)
-
-
-def error_rates(e: Errors, e1_rate: Vec3, b_hat_rate: Vec3, gains: Gains, drag: float) -> tuple[Vec3, Vec3, Vec3]:
-    """e2', e3', e4' of the closed loop (docs/law.md section 3 in one line each), with b_tilde taken as zero.
 
     Args:
-        e: the errors [m].
-        e1_rate: v - p_d' [m/s].
-        b_hat_rate: the estimate's derivative [m/s^3].
-        gains: the gain set.
-        drag: D [1/s].
+        free: Gamma (e2 + e3 + e4) [m/s^3].
+        b_hat: the estimate [m/s^2].
+        bound: B [m/s^2].
     """
-    k1, k2, k3, k4, _, p_max, _, _, _, _ = gains
-    (x, y, z), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
-    x1, y1, z1 = e1_rate
-    c0 = 1.0 / (k1 * k1 * k2)
-    # Ds e1' is the rate of sigma: all of e1' inside, its tangential part shrunk by p_max/|e1| outside.
-    size_sq = x * x + y * y + z * z
-    radial = 0.0
-    bound = 1.0
-    if size_sq > p_max * p_max:
-        bound = p_max / math.sqrt(size_sq)
-        radial = (x * x1 + y * y1 + z * z1) / size_sq
-    kk = k1 * k2
-    ks = kk + k3
-    share = drag / k1
-    # per axis; -D e1'/k1 is the drag's share
-    d0, d1, d2 = kk * (e30 - e20), kk * (e31 - e21), kk * (e32 - e22)
-    e2r0 = bound * (x1 - radial * x) - share * x1 + d0
-    e2r1 = bound * (y1 - radial * y) - share * y1 + d1
-    e2r2 = bound * (z1 - radial * z) - share * z1 + d2
-    g0, g1, g2 = e2r0 + ks * (e40 - e30), e2r1 + ks * (e41 - e31), e2r2 + ks * (e42 - e32)
-    k4s = ks + k4
-    return (
-        (e2r0, e2r1, e2r2),
-        (g0 + c0 * b_hat_rate[0], g1 + c0 * b_hat_rate[1], g2 + c0 * b_hat_rate[2]),
-        (g0 - d0 - k4s * e40, g1 - d1 - k4s * e41, g2 - d2 - k4s * e42),
-    )
-
-
-def thrust_and_torque(
-    e: Errors,
-    b_hat_rate: Vec3,
-    body: tuple[Vec3, Vec3, Vec3],
-    w: Vec3,
-    ref: Reference,
-    thrust: float,
-    thrust_rate: float,
-    parameters: Parameters,
-) -> tuple[float, float, float]:
-    """T'', tau1, tau2 from equations (19), (34), (20).
-
-    Divides by max(T, thrust_min): below that the law is not defined, and the thrust limit keeps the flight away from
-    there.
-    """
-    gains, model, limits = parameters
-    k1, k2, k3, k4, _, _, _, _, _, _ = gains
-    kk = k1 * k2
-    ks = kk + k3
-    k_sum = ks + k4
-    c0 = 1.0 / (k1 * kk)
-    c1 = c0 / ks
-    d = model.drag
-    (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = body
-    w1, w2, w3 = w
-    _, (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
-    j0, j1, j2 = ref.j
-    s0, s1, s2 = ref.s
-    # h (19) without its gyroscopic term, plus c0 b_hat' (34); q4 = p_d'''' + D p_d'''
-    h0 = kk * (e30 - e20) + k_sum * e40 - c1 * (s0 + d * j0) + c0 * b_hat_rate[0]
-    h1 = kk * (e31 - e21) + k_sum * e41 - c1 * (s1 + d * j1) + c0 * b_hat_rate[1]
-    h2 = kk * (e32 - e22) + k_sum * e42 - c1 * (s2 + d * j2) + c0 * b_hat_rate[2]
-    m_c1 = model.mass / c1
-    # S(w) (S(w) T u3 + 2 T' u3) of (19), in body coordinates, where S(w) u3 = (w2, -w1, 0), is added to R'h; its factor
-    # c1/m cancels in (34)
-    t_w3, two_t_rate = thrust * w3, 2.0 * thrust_rate
-    y0 = t_w3 * w1 + two_t_rate * w2 - m_c1 * (r10 * h0 + r11 * h1 + r12 * h2)
-    y1 = t_w3 * w2 - two_t_rate * w1 - m_c1 * (r20 * h0 + r21 * h1 + r22 * h2)
-    y2 = -thrust * (w1 * w1 + w2 * w2) - m_c1 * (r30 * h0 + r31 * h1 + r32 * h2)
-    divisor = max(thrust, limits.thrust_min)
-    return (-y2, y1 / divisor, -y0 / divisor)
+    b0, b1, b2 = b_hat
+    size_sq = b0 * b0 + b1 * b1 + b2 * b2
+    inner = (1.0 - PROJECTION_LAYER) * bound
+    if size_sq <= inner * inner:
+        return free
+    x, y, z = free
+    outward = b0 * x + b1 * y + b2 * z
+    if outward <= 0.0:
+        return free
+    share = min(1.0, (size_sq - inner * inner) / (bound * bound - inner * inner))
+    cut = share * outward / size_sq
+    return (x - cut * b0, y - cut * b1, z - cut * b2)
 
 
 def evaluate(
     state: State, ref: Reference, controller: ControllerState, parameters: Parameters, frozen: bool, dt_s: float
 ) -> Evaluation:
     """The law at one instant: errors, derivatives of the controller's state, angular acceleration.
+
+    Written out per axis in one piece: every tuple and call on the way costs plain Python more than what is done in it.
+    T'' and tau divide by max(T, thrust_min): below that the law is not defined, and the thrust limit keeps the flight
+    away from there.
 
     Args:
         state: the vehicle at the time for which the command is computed.
@@ -304,57 +199,95 @@ def evaluate(
         frozen: the estimator stands still (thrust at a limit, on the ground, stale state).
         dt_s: sample interval for the heading's rate limit [s]; 0 for the continuous form, which has none.
     """
-    gains, model, limits = parameters
+    (k1, k2, k3, k4, gamma, p_max, heading_kind, l1, l2, damping), (mass, gravity, d, _, _, _), limits = parameters
     thrust, thrust_rate, b_hat, memory, _ = controller
-    _, v, q, w = state
-    _, vd, ad, jd, sd, _, _, _ = ref
-    gamma, d = gains.gamma, model.drag
+    (p0, p1, p2), (v0, v1, v2), q, (w1, w2, w3) = state
+    (pd0, pd1, pd2), (vd0, vd1, vd2), (ad0, ad1, ad2), (jd0, jd1, jd2), (sd0, sd1, sd2), _, _, _ = ref
+    b0, b1, b2 = b_hat
     body = axes(q)
-    e = errors(state, ref, thrust, thrust_rate, b_hat, gains, model)
-    b_hat_rate = (0.0, 0.0, 0.0)
-    b_hat_acceleration = (0.0, 0.0, 0.0)
+    (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = body
+    per_k1, kk = 1.0 / k1, k1 * k2
+    ks = kk + k3
+    c0 = per_k1 / kk
+    c1 = c0 / ks
+    t_m, td_m = thrust / mass, thrust_rate / mass
+
+    # What the reference asks for: F/m = g u3 + b_hat - q2 (41), the force per mass with no error, then q3 and q4
+    f0, f1, f2 = b0 - ad0 - d * vd0, b1 - ad1 - d * vd1, b2 - ad2 - d * vd2 + gravity
+    j0, j1, j2 = jd0 + d * ad0, jd1 + d * ad1, jd2 + d * ad2
+    s0, s1, s2 = sd0 + d * jd0, sd1 + d * jd1, sd2 + d * jd2
+
+    # e1 (8), sigma(e1) (26), e1' and e2 (25)
+    e10, e11, e12 = p0 - pd0, p1 - pd1, p2 - pd2
+    x, y, z = e10, e11, e12
+    size_sq = x * x + y * y + z * z
+    outside = size_sq > p_max * p_max
+    if outside:
+        bound = p_max / math.sqrt(size_sq)
+        x, y, z = bound * x, bound * y, bound * z
+    sigma = (x, y, z)
+    x1, y1, z1 = v0 - vd0, v1 - vd1, v2 - vd2
+    e20, e21, e22 = x + per_k1 * x1, y + per_k1 * y1, z + per_k1 * z1
+    # e3 (30): a = F/m - (T/m) r3
+    e30, e31, e32 = e20 + c0 * (f0 - t_m * r30), e21 + c0 * (f1 - t_m * r31), e22 + c0 * (f2 - t_m * r32)
+    # e4 (15): j = -(T'/m) r3 - (T/m) R S(w) u3 - q3, with R S(w) u3 = w2 r1 - w1 r2
+    x, y = t_m * w1, t_m * w2
+    e40 = e30 + c1 * (x * r20 - y * r10 - td_m * r30 - j0)
+    e41 = e31 + c1 * (x * r21 - y * r11 - td_m * r31 - j1)
+    e42 = e32 + c1 * (x * r22 - y * r12 - td_m * r32 - j2)
+
+    # b_hat' (33), and b_hat'' = Gamma (e2' + e3' + e4') with b_tilde taken as zero, which only the heading needs; it is
+    # left out while the projection bends b_hat'
+    b_hat_rate = free = (0.0, 0.0, 0.0)
+    b0_rate = b1_rate = b2_rate = 0.0
+    x2 = y2 = z2 = 0.0
     if not frozen and gamma > 0.0:
-        b_hat_rate = estimator_rate(e, b_hat, gamma, limits.disturbance_max)
-        # b_hat'' is needed by the heading only, and is left out while the projection bends b_hat'
-        x, y, z = e.e2[0] + e.e3[0] + e.e4[0], e.e2[1] + e.e3[1] + e.e4[1], e.e2[2] + e.e3[2] + e.e4[2]
-        if b_hat_rate == (gamma * x, gamma * y, gamma * z):
-            e1_rate = (v[0] - vd[0], v[1] - vd[1], v[2] - vd[2])
-            e2r, e3r, e4r = error_rates(e, e1_rate, b_hat_rate, gains, d)
-            b_hat_acceleration = (
-                gamma * (e2r[0] + e3r[0] + e4r[0]),
-                gamma * (e2r[1] + e3r[1] + e4r[1]),
-                gamma * (e2r[2] + e3r[2] + e4r[2]),
-            )
-    thrust_acceleration, tau1, tau2 = thrust_and_torque(e, b_hat_rate, body, w, ref, thrust, thrust_rate, parameters)
-    # F/m = g u3 + b_hat - q2 and its derivatives: the direction that the thrust will have with no error (41)
-    x, y, z = ad
-    x1, y1, z1 = jd
-    force = (b_hat[0] - x - d * vd[0], b_hat[1] - y - d * vd[1], b_hat[2] - z - d * vd[2] + model.gravity)
-    force_rate = (b_hat_rate[0] - x1 - d * x, b_hat_rate[1] - y1 - d * y, b_hat_rate[2] - z1 - d * z)
-    force_acceleration = (
-        b_hat_acceleration[0] - sd[0] - d * x1,
-        b_hat_acceleration[1] - sd[1] - d * y1,
-        b_hat_acceleration[2] - sd[2] - d * z1,
+        free = (gamma * (e20 + e30 + e40), gamma * (e21 + e31 + e41), gamma * (e22 + e32 + e42))
+        b_hat_rate = projected(free, b_hat, limits.disturbance_max)
+        b0_rate, b1_rate, b2_rate = b_hat_rate
+        if heading_kind != DAMPING and b_hat_rate == free:
+            of_rate, of_e2, of_e3, of_e4 = 3.0 - 3.0 * d * per_k1, -2.0 * kk, -2.0 * k3, ks - k4
+            x2 = of_rate * x1 + of_e2 * e20 + of_e3 * e30 + of_e4 * e40 + c0 * b0_rate
+            y2 = of_rate * y1 + of_e2 * e21 + of_e3 * e31 + of_e4 * e41 + c0 * b1_rate
+            z2 = of_rate * z1 + of_e2 * e22 + of_e3 * e32 + of_e4 * e42 + c0 * b2_rate
+            if outside:  # Ds e1' in place of e1': its tangential part, shrunk by p_max/|e1|
+                less = 3.0 * bound
+                radial, less = less * (e10 * x1 + e11 * y1 + e12 * z1) / size_sq, less - 3.0
+                x2, y2, z2 = x2 + less * x1 - radial * e10, y2 + less * y1 - radial * e11, z2 + less * z1 - radial * e12
+            x2, y2, z2 = gamma * x2, gamma * y2, gamma * z2
+
+    # h (19) without its gyroscopic term, plus c0 b_hat' (34)
+    k_sum = ks + k4
+    h0 = kk * (e30 - e20) + k_sum * e40 - c1 * s0 + c0 * b0_rate
+    h1 = kk * (e31 - e21) + k_sum * e41 - c1 * s1 + c0 * b1_rate
+    h2 = kk * (e32 - e22) + k_sum * e42 - c1 * s2 + c0 * b2_rate
+    # y (34): S(w) (S(w) T u3 + 2 T' u3) of (19), in body coordinates, where S(w) u3 = (w2, -w1, 0), is added to R'h;
+    # its factor c1/m cancels. T'', tau1 and tau2 by (20)
+    m_c1 = mass / c1
+    x, y = thrust * w3, 2.0 * thrust_rate
+    x, y, thrust_acceleration = (
+        x * w1 + y * w2 - m_c1 * (r10 * h0 + r11 * h1 + r12 * h2),
+        x * w2 - y * w1 - m_c1 * (r20 * h0 + r21 * h1 + r22 * h2),
+        thrust * (w1 * w1 + w2 * w2) + m_c1 * (r30 * h0 + r31 * h1 + r32 * h2),
     )
+    divisor = limits.thrust_min
+    divisor = max(divisor, thrust)
+
+    # F/m with its derivatives: the direction that the thrust will have with no error
+    force = (f0, f1, f2), (b0_rate - j0, b1_rate - j1, b2_rate - j2), (x2 - s0, y2 - s1, z2 - s2)
+    turn_max, slow = limits.heading_rate_max, limits.heading_speed_min
     tau3, heading, heading_error = heading_torque(
-        state,
-        ref,
-        (force, force_rate, force_acceleration),
-        memory,
-        gains.heading_kind,
-        (gains.l1, gains.l2, gains.damping),
-        (limits.heading_rate_max, limits.heading_speed_min),
-        dt_s,
-        body,
+        state, ref, force, memory, heading_kind, (l1, l2, damping), (turn_max, slow), dt_s, body
     )
-    return Evaluation(e, b_hat_rate, thrust_acceleration, (tau1, tau2, tau3), heading, heading_error)
+    e = new_record(Errors, ((e10, e11, e12), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), sigma))
+    tau = (y / divisor, -x / divisor, tau3)
+    return new_record(Evaluation, (e, b_hat_rate, thrust_acceleration, tau, heading, heading_error))
 
 
-def rate_setpoint(w: float, tau: float, lag_s: float, dt_s: float) -> float:
-    """Setpoint that, held over dt, takes a first-order rate loop from w to w + tau dt (docs/law.md section 8)."""
-    if lag_s <= 0.0:
-        return w + tau * dt_s
-    return w - tau * dt_s / math.expm1(-dt_s / lag_s)
+def lead_time(lag_s: float, dt_s: float) -> float:
+    """How far ahead a setpoint has to be [s]: w + tau lead, held over dt, takes a first-order rate loop from w to
+    w + tau dt (docs/law.md section 8)."""
+    return dt_s if lag_s <= 0.0 else -dt_s / math.expm1(-dt_s / lag_s)
 
 
 def step(
@@ -377,6 +310,7 @@ def step(
         the command, the next controller state, and the evaluation behind it.
     """
     _, model, limits = parameters
+    _, _, _, (lag_x, lag_y, lag_z), (kx, ky, kz), thrust_lag = model
     thrust_min, thrust_max, (most_x, most_y, most_z), bound, _, _ = limits
     thrust_now, thrust_rate_now, (b0, b1, b2), _, (lead_x, lead_y, lead_z) = controller
     hold = frozen or thrust_now <= thrust_min or thrust_now >= thrust_max
@@ -405,10 +339,11 @@ def step(
         if size_sq > bound * bound:  # the last of the discretisation: the smooth projection has done the rest
             shrink = bound / math.sqrt(size_sq)
             b0, b1, b2 = shrink * b0, shrink * b1, shrink * b2
-    (wx, wy, wz), lag = state.w, model.rate_lag
-    x = rate_setpoint(wx, tau[0], lag[0], dt_s)
-    y = rate_setpoint(wy, tau[1], lag[1], dt_s)
-    z = rate_setpoint(wz, tau[2], lag[2], dt_s)
+    _, _, _, (wx, wy, wz) = state
+    x, y, z = tau
+    ahead_x = lead_time(lag_x, dt_s)
+    ahead_y = ahead_x if lag_y == lag_x else lead_time(lag_y, dt_s)  # mostly they are alike
+    x, y, z = wx + x * ahead_x, wy + y * ahead_y, wz + z * lead_time(lag_z, dt_s)
     if abs(x) > most_x or abs(y) > most_y:
         over = max(abs(x) / most_x, abs(y) / most_y)
         x, y = x / over, y / over
@@ -416,7 +351,6 @@ def step(
     if abs(z) > most_z:
         z = math.copysign(most_z, z)
         flags |= LIMIT_YAW_RATE
-    kx, ky, kz = model.rate_integral
     rx, ry, rz = x - kx * lead_x, y - ky * lead_y, z - kz * lead_z
     if abs(rx) > most_x:
         rx = math.copysign(most_x, rx)
@@ -432,15 +366,15 @@ def step(
         lead_z + dt_s * (z - wz - (kz + LEAD_FADE_1_S) * lead_z),
     )
     # the same inversion for the rotors' lag: the setpoint that brings the thrust to T at the end of the interval
-    ahead = rate_setpoint(thrust_now, (thrust - thrust_now) / dt_s, model.thrust_lag, dt_s)
+    ahead = thrust_now + (thrust - thrust_now) / dt_s * lead_time(thrust_lag, dt_s)
     if ahead > thrust_max:
         ahead = thrust_max
         flags |= LIMIT_THRUST_MAX
     elif ahead < thrust_min:
         ahead = thrust_min
         flags |= LIMIT_THRUST_MIN
-    command = Command(ahead, (rx, ry, rz), (x, y, z), tau, flags)
-    return command, ControllerState(thrust, thrust_rate, (b0, b1, b2), heading, lead), out
+    command = new_record(Command, (ahead, (rx, ry, rz), (x, y, z), tau, flags))
+    return command, new_record(ControllerState, (thrust, thrust_rate, (b0, b1, b2), heading, lead)), out
 
 
 def start(thrust: float, q: Quat, mass: float, gravity: float, bound: float) -> tuple[float, Vec3]:

@@ -9,9 +9,13 @@ and the certificate linearises the very same function.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
-from companion.control.types import State, Vec3
-from companion.control.vectors import quat_exp, quat_normalise
+from companion.control.types import State, Vec3, new_record
+from companion.control.vectors import quat_exp
+
+PIECE = 5
+"""Numbers of a piece: mean thrust setpoint [N], mean rate setpoints [rad/s], duration [s]."""
 
 Lags = tuple[float, float, float, float]
 """Time constants of roll, pitch, yaw rate and thrust behind their setpoints [s]."""
@@ -54,47 +58,66 @@ def advance(
     lags: Factors,
     dt_s: float,
 ) -> tuple[State, float]:
-    """The vehicle dt later, under one command.
+    """The vehicle dt later, under one command: body rates [rad/s] and thrust [N] as they are asked for.
+
+    The rest is as for `through`.
+    """
+    return through(state, thrust, (thrust_setpoint, rates[0], rates[1], rates[2], dt_s), 0, 1, b_hat, vehicle, lags)
+
+
+def through(
+    state: State,
+    thrust: float,
+    pieces: Sequence[float],
+    at: int,
+    count: int,
+    b_hat: Vec3,
+    vehicle: tuple[float, float, float],
+    lags: Factors,
+) -> tuple[State, float]:
+    """The vehicle after some pieces, one command each.
 
     Args:
-        state: where it is.
+        state: where it is; its quaternion has unit length.
         thrust: the thrust that acts now [N].
-        rates: commanded body rates [rad/s].
-        thrust_setpoint: commanded thrust [N].
+        pieces: PIECE numbers each.
+        at: where the first one begins.
+        count: how many.
         b_hat: disturbance estimate, NED [m/s^2].
         vehicle: mass [kg], gravity [m/s^2], drag [1/s].
-        lags: `factors` for this dt.
-        dt_s: above zero [s].
+        lags: `factors` for the pieces' duration.
 
     Returns:
-        the state and the thrust at the end; second order in dt.
+        the state and the thrust at the end; second order in the duration of a piece.
     """
     mass, gravity, drag = vehicle
-    p, v, (a, b, c, d), (wx, wy, wz) = state
-    rx, ry, rz = rates
+    (px, py, pz), (vx, vy, vz), (a, b, c, d), (wx, wy, wz) = state
     x0, x1, y0, y1, z0, z1, t0, t1 = lags
-    # body rates and thrust: where the lag brings them, and their means on the way
-    x, y, z = wx - rx, wy - ry, wz - rz
-    gap = thrust - thrust_setpoint
-    w = (rx + x * x0, ry + y * y0, rz + z * z0)
-    half = 0.5 * (thrust_setpoint + gap * t1) / mass
-    r, i, j, k = quat_exp((dt_s * (rx + x * x1), dt_s * (ry + y * y1), dt_s * (rz + z * z1)))
-    e, f, g, h = quat_normalise(
-        (
+    b0, b1, b2 = b_hat
+    half = 0.5 / mass
+    # the thrust's direction r3
+    north, east, down = 2.0 * (b * d + a * c), 2.0 * (c * d - a * b), 1.0 - 2.0 * (b * b + c * c)
+    for _ in range(count):
+        setpoint, rx, ry, rz, dt_s = pieces[at], pieces[at + 1], pieces[at + 2], pieces[at + 3], pieces[at + 4]
+        at += PIECE
+        # body rates and thrust: where the lag brings them, and their means on the way
+        x, y, z, gap = wx - rx, wy - ry, wz - rz, thrust - setpoint
+        r, i, j, k = quat_exp((dt_s * (rx + x * x1), dt_s * (ry + y * y1), dt_s * (rz + z * z1)))
+        wx, wy, wz = rx + x * x0, ry + y * y0, rz + z * z0
+        a, b, c, d = (
             a * r - b * i - c * j - d * k,
             a * i + b * r + c * k - d * j,
             a * j - b * k + c * r + d * i,
             a * k + b * j - c * i + d * r,
         )
-    )
-    # the sum of the thrust directions r3 at both ends
-    north = 2.0 * (b * d + a * c + f * h + e * g)
-    east = 2.0 * (c * d - a * b + g * h - e * f)
-    down = 2.0 - 2.0 * (b * b + c * c + f * f + g * g)
-    a0 = b_hat[0] - drag * v[0] - half * north
-    a1 = b_hat[1] - drag * v[1] - half * east
-    a2 = b_hat[2] - drag * v[2] - half * down + gravity
-    s = 0.5 * dt_s * dt_s
-    position = (p[0] + dt_s * v[0] + s * a0, p[1] + dt_s * v[1] + s * a1, p[2] + dt_s * v[2] + s * a2)
-    velocity = (v[0] + dt_s * a0, v[1] + dt_s * a1, v[2] + dt_s * a2)
-    return State(position, velocity, (e, f, g, h), w), thrust_setpoint + gap * t0
+        from_north, from_east, from_down = north, east, down
+        north, east, down = 2.0 * (b * d + a * c), 2.0 * (c * d - a * b), 1.0 - 2.0 * (b * b + c * c)
+        pull = half * (setpoint + gap * t1)
+        a0 = b0 - drag * vx - pull * (from_north + north)
+        a1 = b1 - drag * vy - pull * (from_east + east)
+        a2 = b2 - drag * vz - pull * (from_down + down) + gravity
+        s = 0.5 * dt_s
+        px, py, pz = px + dt_s * (vx + s * a0), py + dt_s * (vy + s * a1), pz + dt_s * (vz + s * a2)
+        vx, vy, vz = vx + dt_s * a0, vy + dt_s * a1, vz + dt_s * a2
+        thrust = setpoint + gap * t0
+    return new_record(State, ((px, py, pz), (vx, vy, vz), (a, b, c, d), (wx, wy, wz))), thrust

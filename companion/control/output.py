@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from companion.control.law import torque
-from companion.control.types import Quat, Vec3
+from companion.control.types import Quat, Vec3, new_record
 from companion.control.vectors import clip, quat_exp, quat_multiply, quat_normalise
 
 LEAD_FILTER_S = 0.015
@@ -100,7 +100,8 @@ def thrust_fraction(thrust_n: float, full_n: float, curve_factor: float) -> floa
 
 def rates_output(thrust_n: float, rates: Vec3, conversion: Conversion) -> RateSetpoint:
     """Body rates and thrust as they are."""
-    return RateSetpoint(thrust_fraction(thrust_n, conversion.thrust_full_n, conversion.curve_factor), rates)
+    share = thrust_fraction(thrust_n, conversion.thrust_full_n, conversion.curve_factor)
+    return new_record(RateSetpoint, (share, rates))
 
 
 def attitude_output(

@@ -32,7 +32,8 @@ def dot(a: Vec3, b: Vec3) -> float:
 
 def cross(a: Vec3, b: Vec3) -> Vec3:
     """S(a) b = a x b."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    (x, y, z), (u, v, w) = a, b
+    return (y * w - z * v, z * u - x * w, x * v - y * u)
 
 
 def norm(a: Vec3) -> float:
@@ -103,4 +104,4 @@ def quat_normalise(q: Quat) -> Quat:
 
 def clip(x: float, low: float, high: float) -> float:
     """The value x, held within [low, high]."""
-    return min(max(x, low), high)
+    return low if x < low else high if x > high else x

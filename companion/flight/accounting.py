@@ -143,19 +143,27 @@ class Accounting:
             return age_ns * 1e-9, (age_ns + sent_ns - arrival_ns) * 1e-6
         return self._watch.age_s(t_us, arrival_ns), (self._clock.now_s(sent_ns) - t_us * 1e-6) * 1e3
 
-    def reckon(self, step: FlownStep, z: Any, m: Any, sent_ns: int, asked_ns: int | None, state_s: float) -> bool:
+    def reckon(
+        self,
+        step: FlownStep,
+        z: Any,
+        work: tuple[Any, Any] | None,
+        sent_ns: int,
+        asked_ns: int | None,
+        state_s: float,
+    ) -> bool:
         """Records a step by reflex, if nothing else is to be done about it; see `flight.reckoning`.
 
         Args:
             step: that was flown.
             z: of the reflex.
-            m: of the step; None where its reference was not on the curve.
+            work: of the step and its curve; None where its reference was not on one.
             sent_ns: when its setpoint went out, `time.monotonic_ns()`.
             asked_ns: the vehicle's time when it asked for our answer in lockstep [ns]; None elsewhere.
             state_s: vehicle time at the arrival of its state [s].
         """
         calm = self._watch.calm(state_s)
-        if calm is None or m is None or self._reckoner is None or sent_ns - self._shown_ns > PROGRESS_NS:
+        if calm is None or work is None or self._reckoner is None or sent_ns - self._shown_ns > PROGRESS_NS:
             return False
         state, _, _, _, phase, track_s, _, arrival_ns = step
         age_s, sent_age_ms = self._ages(state.t_vehicle_us, arrival_ns, sent_ns, asked_ns)
@@ -165,7 +173,7 @@ class Accounting:
             self._phase, self._phase_index = phase, PHASE_INDEX[phase]
         shown_s = track_s if phase is Phase.TRACK else math.nan
         given = (shown_s, self._phase_index, sent_age_ms, took_ns * 1e-3, late, state_s, calm.delay_s, *calm.limits)
-        row = self._reckoner.step(z, m, given, calm.envelope, calm.following)
+        row = self._reckoner.step(z, *work, given, calm.envelope, calm.following)
         if row is None:
             return False
         self._record.append_packed(row)

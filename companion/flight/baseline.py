@@ -15,11 +15,12 @@ import math
 
 from companion.config import Vehicle
 from companion.control import flat
-from companion.control.output import PositionSetpoint
+from companion.control.output import PositionSetpoint, Setpoint
 from companion.control.types import GRAVITY_M_S2, Reference, State
 from companion.control.vectors import quat_exp, quat_multiply
+from companion.flight.engines import ReferenceAt
 from companion.flight.resets import Reset
-from companion.flight.tracker import ReferenceAt, TrackerStep
+from companion.flight.tracker import Stepping, TrackerStep
 from companion.frames import wrap_angle, yaw_from_quat
 
 _NOTHING = [math.nan] * flat.RESULTS
@@ -27,7 +28,7 @@ _NOTHING[flat.LIMITS] = 0.0
 _BEFORE_HEADING, _AFTER_HEADING = tuple(_NOTHING[: flat.HEADING_ERROR]), tuple(_NOTHING[flat.HEADING_ERROR + 1 :])
 
 
-class Px4Baseline:
+class Px4Baseline(Stepping):
     """Sends the reference itself.
 
     The nose does what the vehicle file's [controller] heading asks of the law: along the reference's horizontal
@@ -48,6 +49,7 @@ class Px4Baseline:
         self._seen: State | None = None
         self._yaw = 0.0
         self._held = True
+        self._last: TrackerStep | None = None
 
     def begin(self, state: State, thrust_n: float | None = None) -> None:
         """Starts from a hover: the nose stays where it points."""
@@ -55,7 +57,7 @@ class Px4Baseline:
         self._held = True
         self._last_s = None
 
-    def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
+    def command(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> Setpoint:
         """The setpoint for one state; of the record's numbers only the heading error exists.
 
         Args:
@@ -72,7 +74,13 @@ class Px4Baseline:
             yaw, yaw_rate = self._turn(*self._wanted(reference), dt_s)
             error = wrap_angle(yaw_from_quat(state.q) - (yaw - yaw_rate * self.delay_s))  # at the state's stamp
         setpoint = PositionSetpoint(reference.p, reference.v, reference.a, yaw, yaw_rate)
-        return TrackerStep(setpoint, (*_BEFORE_HEADING, error, *_AFTER_HEADING))
+        self._last = TrackerStep(setpoint, (*_BEFORE_HEADING, error, *_AFTER_HEADING))
+        return setpoint
+
+    def last_step(self) -> TrackerStep:
+        """The last step, for the record."""
+        assert self._last is not None
+        return self._last
 
     def foresee(self, stamp_s: float) -> tuple[State, float] | None:
         """The last state, moved on as it was; and the thrust of a hover over the mass [m/s^2]."""

@@ -12,13 +12,14 @@ from collections.abc import Callable
 from companion.config import Flight
 from companion.control import flat
 from companion.control.hover import hover
-from companion.control.output import RateSetpoint, thrust_fraction
+from companion.control.output import RateSetpoint, Setpoint, thrust_fraction
 from companion.control.types import GRAVITY_M_S2, Reference, State, Vec3
 from companion.control.vectors import axes, clip, norm, quat_exp, quat_multiply
+from companion.flight.engines import ReferenceAt
 from companion.flight.manoeuvres import Kind, Manoeuvre, Slot, plan
 from companion.flight.phases import Autopilot
 from companion.flight.resets import Reset
-from companion.flight.tracker import ReferenceAt, TrackerStep
+from companion.flight.tracker import Stepping, TrackerStep
 from companion.frames import tilt_from_quat, wrap_angle, yaw_from_quat
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
@@ -42,7 +43,7 @@ _NOTHING[flat.LIMITS] = 0.0
 _NOTHING[flat.B_HAT] = [0.0, 0.0, 0.0]
 
 
-class Calibrator:
+class Calibrator(Stepping):
     """Hovers and excites.
 
     Args:
@@ -67,6 +68,7 @@ class Calibrator:
         self._integral: Vec3 = ZERO
         self._at = 0
         self._running = False
+        self._last: TrackerStep | None = None
         self.flown = 0
         """Manoeuvres that were begun and not ended early."""
 
@@ -80,7 +82,7 @@ class Calibrator:
         self._integral = (-GRAVITY_M_S2 * r3[0] / max(r3[2], 0.5), -GRAVITY_M_S2 * r3[1] / max(r3[2], 0.5), 0.0)
         self._at, self._running, self.flown = 0, False, 0
 
-    def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
+    def command(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> Setpoint:
         """The setpoint for one state.
 
         Args:
@@ -108,7 +110,13 @@ class Calibrator:
         elif manoeuvre is not None and open_loop:
             thrust = (1.0 + manoeuvre.step(since_s)) / max(axes(state.q)[2][2], 0.8)
         share = clip(self.hover_share * thrust, *THRUST_LIMITS)
-        return self._out(share, (rates[0], rates[1], rates[2]), command.integral)
+        self._last = self._out(share, (rates[0], rates[1], rates[2]), command.integral)
+        return self._last.setpoint
+
+    def last_step(self) -> TrackerStep:
+        """The last step, for the record."""
+        assert self._last is not None
+        return self._last
 
     def foresee(self, stamp_s: float) -> tuple[State, float] | None:
         """The last state, moved on as it was; and the thrust of a hover over the mass [m/s^2]."""

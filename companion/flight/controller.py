@@ -6,12 +6,14 @@ from collections.abc import Callable
 from typing import Protocol
 
 from companion.config import Flight
+from companion.control.output import Setpoint
 from companion.control.types import State
 from companion.flight.baseline import Px4Baseline
 from companion.flight.calibration import Calibrator
+from companion.flight.engines import Kernels, ReferenceAt
 from companion.flight.phases import Autopilot
 from companion.flight.resets import Reset
-from companion.flight.tracker import Kernels, ReferenceAt, Tracker, TrackerStep
+from companion.flight.tracker import Tracker, TrackerStep
 
 
 class Controller(Protocol):
@@ -26,7 +28,7 @@ class Controller(Protocol):
         """
         ...
 
-    def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
+    def command(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> Setpoint:
         """The setpoint for one state.
 
         Args:
@@ -35,6 +37,14 @@ class Controller(Protocol):
             reference_at: the reference as a function of vehicle time [s].
             frozen: hold what is estimated still.
         """
+        ...
+
+    def last_step(self) -> TrackerStep:
+        """All that is known of the last step; for what can wait until its setpoint is out."""
+        ...
+
+    def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
+        """Both at once, where nobody waits for the setpoint."""
         ...
 
     def foresee(self, stamp_s: float) -> tuple[State, float] | None:

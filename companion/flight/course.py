@@ -166,6 +166,8 @@ class Course:
         self.curves = tuple(_curves(zip((*pieces, path, stopping), self._chain.starts_s, strict=True)))
         """Its pieces as numbers, those that have any."""
         self._tempo = Tempo()
+        self.changes_s = math.inf
+        """Time since engaging at which its pace changes first [s]; infinity: it was never changed."""
         self.moved_m: Vec3 = ZERO
         """By how much it was moved since it was planned, NED: its hold point, path, home and origin do not show it."""
 
@@ -176,7 +178,7 @@ class Course:
 
     def at(self, t_s: float) -> Reference:
         """The reference, `t_s` after engaging; before 0 the start, after the end the point of rest."""
-        if self._tempo.steady:
+        if t_s < self.changes_s:
             reference = self._at_own_pace(t_s)
         else:
             pace = self._tempo.at(t_s)
@@ -215,11 +217,6 @@ class Course:
         self.moved_m = (x + dx, y + dy, z + dz)
         for curve in self.curves:
             curve.numbers[MOVED : MOVED + 3] = self.moved_m
-
-    @property
-    def changes_s(self) -> float:
-        """Time since engaging at which its pace changes first [s]; infinity: it was never changed."""
-        return self._tempo.changes_s
 
     def _at_own_pace(self, course_s: float) -> Reference:
         on_track_s = course_s - self.join_s
@@ -264,6 +261,7 @@ class Course:
     def change_pace(self, ramp: Ramp) -> None:
         """Takes a change of pace that was planned, or recorded."""
         self._tempo.add(ramp)
+        self.changes_s = self._tempo.changes_s
 
 
 class Timed:
@@ -276,28 +274,37 @@ class Timed:
 
     def __init__(self, course: Course, begin_s: float) -> None:
         self.course, self.begin_s = course, begin_s
-        self._curve = course.curves[0] if course.curves else None
+        self._take(course.curves[0] if course.curves else None)
+
+    def _take(self, curve: Curve | None) -> None:
+        self.on = curve
+        """The curve of the last answer."""
+        self._from_s, self._length_s = (0.0, -math.inf) if curve is None else (curve.begin_s, curve.duration_s)
 
     def __call__(self, t_s: float) -> Reference:
         """The reference at a vehicle time [s]."""
         return self.course.at(t_s - self.begin_s)
+
+    def goes_on(self, stamp_s: float, delay_s: float) -> bool:
+        """Whether the curve of the last answer gives the reference at a stamp and a delay later [s], too."""
+        # in the order in which `fused.flight_step` works them out: at an end the last digit counts
+        now_s, effect_s = stamp_s - self.begin_s, stamp_s + delay_s - self.begin_s
+        begin_s = self._from_s
+        return now_s >= begin_s and effect_s - begin_s <= self._length_s and effect_s < self.course.changes_s
 
     def curve(self, stamp_s: float, delay_s: float) -> Curve | None:
         """The curve that gives the reference at a stamp and a delay later [s], where one does; else None.
 
         It goes by the times alone: a replay, which knows all changes of the pace from its beginning, takes the same.
         """
-        course, curve = self.course, self._curve
-        # in the order in which `fused.flight_step` works them out: at an end the last digit counts
-        now_s, effect_s = stamp_s - self.begin_s, stamp_s + delay_s - self.begin_s
-        if curve is None or effect_s >= course.changes_s:
-            return None
-        if now_s >= curve.begin_s and effect_s - curve.begin_s <= curve.duration_s:  # as the last time
-            return curve
-        for other in course.curves:
-            if now_s >= other.begin_s and effect_s - other.begin_s <= other.duration_s:
-                self._curve = other
+        if self.goes_on(stamp_s, delay_s):
+            return self.on
+        last = self.on
+        for other in self.course.curves:
+            self._take(other)
+            if self.goes_on(stamp_s, delay_s):
                 return other
+        self._take(last)
         return None
 
 

@@ -21,9 +21,9 @@ from companion.campaign.predict import gate_prediction
 from companion.config import Flight
 from companion.errors import CompanionError, ExitCode
 from companion.flight.course import Course
+from companion.flight.engines import kernels
 from companion.flight.preflight import gate_calibration, gate_gains, gate_place, gate_reference
 from companion.flight.surroundings import gate_course
-from companion.flight.tracker import kernels
 from companion.frames import radians
 from companion.link.vehicle_link import VehicleLink
 from companion.record.folder import create_flight_folder, write_configuration

@@ -29,6 +29,7 @@ from companion.flight.coast import coast_setpoint
 from companion.flight.connect import AUTOPILOT_COMPONENT, explain_no_time, find_autopilot, send_heartbeat
 from companion.flight.controller import controller_of
 from companion.flight.course import Course, Timed, at_rest
+from companion.flight.engines import Kernels
 from companion.flight.host import Alone, Host
 from companion.flight.last_resort import ask_for_hold
 from companion.flight.measure import silence_limit_s
@@ -40,7 +41,7 @@ from companion.flight.responses import respond
 from companion.flight.retuning import ParameterChange, Retuning
 from companion.flight.sequence import Duty, Sequence
 from companion.flight.streams import Streams
-from companion.flight.tracker import Kernels, Tracker, TrackerStep
+from companion.flight.tracker import Tracker, TrackerStep
 from companion.flight.watch import Watch
 from companion.frames import yaw_from_quat
 from companion.link import codec, timesync
@@ -584,7 +585,7 @@ class FlightLoop:
         now = State(state.p, state.v, state.q, state.w)
         self._tracker.begin(now)
         hold = at_rest(state.p, yaw_from_quat(state.q))
-        self._send(self._tracker.step(state.t_vehicle_us * 1e-6, now, lambda t: hold).setpoint, state)
+        self._send(self._tracker.command(state.t_vehicle_us * 1e-6, now, lambda t: hold), state)
 
     def _engage(self, state: VehicleState) -> None:
         """OFFBOARD is confirmed: the controller starts from the hover."""
@@ -628,12 +629,12 @@ class FlightLoop:
         assert sequence.course is not None
         course, begin_s = sequence.course, sequence.engaged_at_s
         stamp_s = state.t_vehicle_us * 1e-6
-        out = self._tracker.step(stamp_s, State(state.p, state.v, state.q, state.w), self._reference(course, begin_s))
-        if not self._send(out.setpoint, state):
+        now = State(state.p, state.v, state.q, state.w)
+        if not self._send(self._tracker.command(stamp_s, now, self._reference(course, begin_s)), state):
             self._lost += 1
             return
         self._sent_ns = time.monotonic_ns()
-        self._flown(state, out, skipped, arrival_ns)
+        self._flown(state, self._tracker.last_step(), skipped, arrival_ns)
 
     def _use_at_once(self, datagrams: list[Datagram]) -> int:
         """Uses what has come as far as it is attitudes and one ordinary state, which is answered; how many it was."""
@@ -762,8 +763,8 @@ class FlightLoop:
             self._retuning.tick()
         if step.out is None:
             assert self._reflex is not None and isinstance(self._tracker, Tracker)
-            work = self._reflex.numbers, self._tracker.numbers
-            if self._accounting.reckon(step, *work, self._sent_ns, self._asked_ns, self._last_state_s):
+            times = self._sent_ns, self._asked_ns, self._last_state_s
+            if self._accounting.reckon(step, self._reflex.numbers, self._tracker.memory, *times):
                 return
             step = step._replace(out=self._tracker.last_step())
         measured = self._accounting.measure(step, self._sent_ns, self._asked_ns)

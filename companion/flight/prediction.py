@@ -11,6 +11,7 @@ from collections.abc import MutableSequence, Sequence
 
 from companion import accelerate
 from companion.control import history
+from companion.control.model import PIECE
 from companion.control.types import Vec3
 
 PIECE_MAX_S = 0.010
@@ -35,7 +36,7 @@ class Prediction:
     def __init__(self, thrust_lag_s: float, delay_s: float, thrust_n: float, engine: str = "python") -> None:
         self.numbers: MutableSequence[float] = accelerate.numbers(history.CAPACITY, engine)
         """The history, as `control.history` lays it out."""
-        self._out = accelerate.numbers(history.PIECE * PIECES_MAX, engine)
+        self._out = accelerate.numbers(PIECE * PIECES_MAX, engine)
         self._thrust_lag_s = thrust_lag_s
         self._begin = accelerate.choose(history.begin, engine)
         self._remember = accelerate.choose(history.remember, engine)
@@ -81,9 +82,9 @@ class Prediction:
         self._follow(self.numbers, stamp_s)
 
     def pieces(self, stamp_s: float) -> Sequence[float]:
-        """What acts from a stamp until its own command will, `history.PIECE` numbers each; empty without a delay."""
+        """What acts from a stamp until its own command will, `PIECE` numbers each; empty without a delay."""
         self.follow(stamp_s)
-        return self._out[: history.PIECE * self._gather(self.numbers, stamp_s, self._out, 0)]
+        return self._out[: PIECE * self._gather(self.numbers, stamp_s, self._out, 0)]
 
     def between(self, begin_s: float, end_s: float) -> list[Span]:
         """What acts from the stamp that was asked for last to a later time [s]."""

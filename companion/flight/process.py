@@ -22,11 +22,11 @@ from companion.config import Flight, build_flight, read_toml
 from companion.errors import CompanionError, ExitCode
 from companion.flight.accounting import Progress
 from companion.flight.controller import controller_of
+from companion.flight.engines import Kernels, kernels
 from companion.flight.host import Host
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.preflight import BASELINE_PARAMETERS, gate_gains
-from companion.flight.tracker import Kernels, kernels
 from companion.link.framing import refused_since
 from companion.link.transport import parse_connection
 from companion.link.vehicle_link import VehicleLink
@@ -233,7 +233,7 @@ def warm_up(flight: Any, compiled: Any) -> None:
     state = State(zero, zero, (1.0, 0.0, 0.0, 0.0), zero)
     tracker.begin(state)
     for i in range(3):
-        tracker.step(1.0 + i / flight.vehicle.link.state_rate_hz, state, lambda t: at_rest(zero, 0.0))
+        tracker.command(1.0 + i / flight.vehicle.link.state_rate_hz, state, lambda t: at_rest(zero, 0.0))
     if compiled.engine == "numba":
         Reflex(1, (1, COMPANION_COMPONENT))
         Reckoner()

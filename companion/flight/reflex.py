@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from companion import accelerate
-from companion.control import flat, history
+from companion.control import history
 from companion.control.types import Quat, Vec3, new_record
 from companion.control.vectors import rotate_to_inertial
 from companion.flight import fused
@@ -92,16 +92,14 @@ GIVEN = OUTPUT + 16
 STAMP_US, OUT_BYTES, ASKED_NS = range(GIVEN + 12, GIVEN + 15)
 """What is told: stamp of the state, length of what is sent, the request in lockstep [ns]."""
 FLOATS = GIVEN + 15
-LAST_S, GAP_MAX_S = range(2)
-"""Given as floats, from FLOATS on: stamp of the last step, the longest gap to integrate over [s]."""
-BEFORE = 2
+"""Floats."""
+BEFORE = 0
 """The 13 numbers of the message before, as they came."""
 SEEN = BEFORE + 13
 """The 13 numbers of the state: position, velocity, quaternion, rates."""
 SIZE = FLOATS + SEEN + 13
 DATAGRAM_MAX = 8 * (OUTPUT - DATAGRAM) - AT
 
-_RATES = fused.RESULTS + flat.RATES.start
 _UINT32 = 0xFFFFFFFF
 _ODOMETRY_BYTES = ODOMETRY_MIN + 12
 _ODOMETRY_LOW = ODOMETRY & 0xFF
@@ -135,8 +133,10 @@ def reflex(z: Any, m: Any, h: Any, r: Any) -> int:
         return DECLINED
     if not (_sound_message(z, bytes_in) and _sound_state(f, floats_in, bytes_in[PAYLOAD + CHILD_FRAME_ID])):
         return DECLINED
-    if not _goes_on(f, m, z[STAMP_US] * 1e-6):
+    stamp_s = z[STAMP_US] * 1e-6
+    if not 0.0 < stamp_s - m[fused.LAST] <= m[fused.GAP_MAX]:
         return DECLINED
+    m[fused.STAMP], m[fused.WHOLE], m[fused.FREEZE] = stamp_s, 1.0, 0.0
     _remember(f, m, floats_in)
     flight_step(m, h, r)
     if not _sendable(m):
@@ -203,15 +203,6 @@ def _sound_state(f: MutableSequence[float], floats: Sequence[float], child: int)
     return True
 
 
-def _goes_on(f: Sequence[float], m: MutableSequence[float], stamp_s: float) -> bool:
-    """Gives the step its times; whether it goes on from the last one."""
-    dt_s = stamp_s - f[LAST_S]
-    m[fused.STAMP], m[fused.WHOLE] = stamp_s, 1.0
-    i = fused.INPUT
-    m[i + flat.DT], m[i + flat.FROZEN], m[i + flat.INTEGRATE] = dt_s, 0.0, 1.0
-    return 0.0 < dt_s <= f[GAP_MAX_S]
-
-
 def _remember(f: MutableSequence[float], m: MutableSequence[float], floats: Sequence[float]) -> None:
     """Gives the step its state, and keeps the message as it came for the next one."""
     for k in range(13):
@@ -221,16 +212,17 @@ def _remember(f: MutableSequence[float], m: MutableSequence[float], floats: Sequ
 
 def _sendable(m: Sequence[float]) -> bool:
     """The last check before the vehicle, as `setpoint.check` makes it."""
-    rates = (m[_RATES], m[_RATES + 1], m[_RATES + 2])
-    return 0.0 <= m[fused.SHARE] <= 1.0 and within(rates, RATE_BOUND_RAD_S)
+    i = fused.SENT
+    return 0.0 <= m[i] <= 1.0 and within((m[i + 1], m[i + 2], m[i + 3]), RATE_BOUND_RAD_S)
 
 
 def _write(z: Any, m: Sequence[float], system: int) -> None:
     """Frames the setpoint, and in lockstep the answer behind it."""
     o, floats = z[OUTPUT:GIVEN].view(np.uint8), z[OUTPUT:GIVEN].view(np.float32)
     own, target, seq = (z[OWN_SYSTEM], z[OWN_COMPONENT]), (system, AUTOPILOT_COMPONENT), z[OUT_SEQ]
-    rates = (m[_RATES], m[_RATES + 1], m[_RATES + 2])
-    write_rates(o, floats, z[STAMP_US] // 1000 & _UINT32, rates, m[fused.SHARE], target, MASK_RATES)
+    i = fused.SENT
+    rates = (m[i + 1], m[i + 2], m[i + 3])
+    write_rates(o, floats, z[STAMP_US] // 1000 & _UINT32, rates, m[i], target, MASK_RATES)
     length, message, extra = SET_ATTITUDE_TARGET_BYTES, SET_ATTITUDE_TARGET, SET_ATTITUDE_TARGET_EXTRA
     stop = close_frame(o, AT, length, seq, own, message, extra)
     if z[ASKED_US] >= 0:
@@ -248,21 +240,19 @@ class Reflex:
     """
 
     def __init__(self, system: int, own: tuple[int, int]) -> None:
-        self._kernel = accelerate.compile_kernel(reflex)
         self._z = np.zeros(SIZE, np.int64)
+        nothing = (np.zeros(fused.SIZE), np.zeros(history.CAPACITY), np.zeros(fused.NO_CURVE))
+        self._kernel = accelerate.compile_for(reflex, self._z, *nothing)
         self._longs = self._z.data
         self._bytes = self._longs.cast("B")
         self._datagram = self._bytes[AT : AT + DATAGRAM_MAX]
         self._output = self._bytes[8 * OUTPUT + AT : 8 * GIVEN]
         self._give = struct.Struct("=9q").pack_into
-        self._give_times = struct.Struct("=2d").pack_into
         self._give_numbers = struct.Struct("=13d").pack_into
         self._told = struct.Struct("=26d").unpack_from
         self._numbers: Numbers | None = None
         """Of the message before, as the memory has them."""
         self._longs[SYSTEM], self._longs[OWN_SYSTEM], self._longs[OWN_COMPONENT] = system, *own
-        nothing = (np.zeros(fused.SIZE), np.zeros(history.CAPACITY), np.zeros(fused.NO_CURVE))
-        self._kernel(self._z, *nothing)  # compiled or loaded now, and never in the air
 
     def take(self, datagram: bytes, given: tuple[int, ...], before: Numbers) -> bool:
         """Takes a datagram that may hold an ordinary state.
@@ -294,17 +284,14 @@ class Reflex:
         """Of the state in the datagram that was taken, if it is one [us]."""
         return self._longs[STAMP_US]
 
-    def run(self, m: Any, h: Any, r: Any, last_s: float, gap_max_s: float) -> int:
+    def run(self, m: Any, h: Any, r: Any) -> int:
         """Answers what was taken; see `reflex`.
 
         Args:
             m: of the step's engine.
             h: the history.
             r: the curve.
-            last_s: stamp of the last step [s].
-            gap_max_s: the longest gap to integrate over.
         """
-        self._give_times(self._bytes, 8 * FLOATS, last_s, gap_max_s)
         return int(self._kernel(self._z, m, h, r))
 
     def told(self) -> tuple[VehicleState, Numbers]:

@@ -21,9 +21,10 @@ from companion.control.law import ControllerState, Gains, Limits, Model, Paramet
 from companion.control.model import Factors
 from companion.control.types import Reference, State
 from companion.errors import InputError
+from companion.flight.engines import Engine, Numbers, Stepped, stepped
 
 if TYPE_CHECKING:
-    from companion.flight.tracker import Engine, Numbers, Tracker
+    from companion.flight.tracker import Tracker
 
 RAMP_S: Final = 2.0
 """How long the way to new parameters takes."""
@@ -188,6 +189,7 @@ class Turning:
         """Of the new engine in what goes out on the yaw axis."""
         self._old, self._kind = old, kind
         self._first = True
+        self._numbers: Numbers = ()
 
     def begin(self, controller: ControllerState) -> None:
         """Takes a new controller state."""
@@ -222,13 +224,19 @@ class Turning:
         frozen: bool,
         integrate: bool,
         dt_s: float,
-    ) -> Numbers:
+    ) -> Stepped:
         """One step of both, mixed."""
-        before = self._old.step(state, reference, thrust, pieces, frozen, integrate, dt_s)
-        numbers = list(self.new.step(state, reference, thrust, pieces, frozen, integrate, dt_s))
+        for engine in (self._old, self.new):
+            engine.step(state, reference, thrust, pieces, frozen, integrate, dt_s)
+        before, numbers = self._old.numbers(), list(self.new.numbers())
         for index in _YAW:
             numbers[index] = (1.0 - self.share) * before[index] + self.share * numbers[index]
-        return tuple(numbers)
+        self._numbers = tuple(numbers)
+        return stepped(self._numbers)
+
+    def numbers(self) -> Numbers:
+        """All of the last step, mixed."""
+        return self._numbers
 
 
 class _Wanted(NamedTuple):

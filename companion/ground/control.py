@@ -23,11 +23,11 @@ from companion.config import build_flight
 from companion.errors import CompanionError, ExitCode, InputError, LinkError
 from companion.flight.accounting import Progress
 from companion.flight.connect import AUTOPILOT_COMPONENT
+from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import Cause, LandedState, Order, Phase
 from companion.flight.process import Status, ask_the_system, warm_up
 from companion.flight.retuning import ParameterChange
-from companion.flight.tracker import kernels
 from companion.ground.channel import Channel, Copy, Outgoing
 from companion.ground.filter import Gate
 from companion.ground.hosting import tuned, tuning_of, vehicle_of

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from math import cos, hypot, sin
 from typing import Literal
 
-from companion.control.types import Reference, Vec3
+from companion.control.types import Reference, Vec3, new_record
 from companion.errors import RefusedError
 from companion.frames import GeoPoint
 from companion.trajectory.fence import Fence
@@ -135,23 +135,16 @@ class Anchored:
         trajectory = replace(self.trajectory, duration_s=t_s)
         return replace(self, trajectory=trajectory, run_out_s=run_out_duration_s(hypot(*trajectory.at(t_s).v)))
 
-    def _placed(self, r: Reference) -> Reference:
-        x, y, z = self.offset_m
-        if self.yaw_rad == 0.0:
-            p = (r.p[0] + x, r.p[1] + y, r.p[2] + z)
-            return Reference(p, r.v, r.a, r.j, r.s, r.yaw, r.yaw_rate, r.yaw_acceleration)
-        c, s = self.cos_yaw, self.sin_yaw
-        p = rotated(c, s, r.p)
-        return Reference(
-            (p[0] + x, p[1] + y, p[2] + z),
-            rotated(c, s, r.v),
-            rotated(c, s, r.a),
-            rotated(c, s, r.j),
-            rotated(c, s, r.s),
-            r.yaw + self.yaw_rad,
-            r.yaw_rate,
-            r.yaw_acceleration,
-        )
+    def _placed(self, reference: Reference) -> Reference:
+        p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
+        turned = self.yaw_rad
+        if turned != 0.0:
+            cos_yaw, sin_yaw = self.cos_yaw, self.sin_yaw
+            p, v, a = rotated(cos_yaw, sin_yaw, p), rotated(cos_yaw, sin_yaw, v), rotated(cos_yaw, sin_yaw, a)
+            j, s, yaw = rotated(cos_yaw, sin_yaw, j), rotated(cos_yaw, sin_yaw, s), yaw + turned
+        (x, y, z), (north, east, down) = p, self.offset_m
+        p = (x + north, y + east, z + down)
+        return new_record(Reference, (p, v, a, j, s, yaw, yaw_rate, yaw_acceleration))
 
 
 def anchored(trajectory: Trajectory, hold_point: Vec3, home_point: Vec3 | None) -> Anchored:

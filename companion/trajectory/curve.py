@@ -132,6 +132,8 @@ def _steady_heading(r: Sequence[float], t_s: float) -> Vec3:
 def _wave(r: Sequence[float], at: int, t_s: float) -> Derivatives:
     """Return an axis and its first four derivatives."""
     centre, slope, amplitude, w, phase = r[at], r[at + 1], r[at + 2], r[at + 3], r[at + 4]
+    if amplitude == 0.0:
+        return centre + slope * t_s, slope, 0.0, 0.0, 0.0
     angle = w * t_s + phase
     s, c = amplitude * math.sin(angle), amplitude * math.cos(angle)
     w2 = w * w

@@ -13,7 +13,7 @@ from fractions import Fraction
 from math import cos, isclose, lcm, pi, sin
 from typing import NamedTuple
 
-from companion.control.types import Reference, Vec3
+from companion.control.types import Reference, Vec3, new_record
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
@@ -220,21 +220,17 @@ class Lemniscate(Shape):
         u = 2.0 * w
         w2 = w * w
         u2 = u * u
-        north, east = self.amplitude_m
+        (north, east), (x, y, z), (yaw, yaw_rate) = self.amplitude_m, self.center_m, self.heading
         nc, ns = north * cos(w * t_s), north * sin(w * t_s)
         ec, es = east * cos(u * t_s), east * sin(u * t_s)
-        center = self.center_m
-        yaw_rate = self.heading.yaw_rate_rad_s
-        return Reference(
-            (center[0] + nc, center[1] + es, center[2]),
+        derivatives = (
+            (x + nc, y + es, z),
             (-w * ns, u * ec, 0.0),
             (-w2 * nc, -u2 * es, 0.0),
             (w2 * w * ns, -u2 * u * ec, 0.0),
             (w2 * w2 * nc, u2 * u2 * es, 0.0),
-            self.heading.yaw_rad + yaw_rate * t_s,
-            yaw_rate,
-            0.0,
         )
+        return new_record(Reference, (*derivatives, yaw + yaw_rate * t_s, yaw_rate, 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,10 +25,10 @@ from companion.config import Flight, build_flight, find, read_toml
 from companion.errors import ExitCode
 from companion.flight import loop as loop_module
 from companion.flight.bundled import free_udp_port
+from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.process import warm_up
-from companion.flight.tracker import kernels
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.record.summary import FlightMeta, summarise

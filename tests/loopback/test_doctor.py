@@ -18,10 +18,10 @@ from companion.cli import main
 from companion.config import Flight
 from companion.errors import ExitCode
 from companion.flight.bundled import free_udp_port
+from companion.flight.engines import kernels
 from companion.flight.findings import Finding, Gate, Verdict
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
-from companion.flight.tracker import kernels
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.load import of_flight

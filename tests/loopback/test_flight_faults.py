@@ -298,7 +298,7 @@ def test_guards(limit: str, tmp_path) -> None:
 
 
 def raises(flying):
-    step, count = flying._tracker.step, [0]
+    step, count = flying._tracker.command, [0]
 
     def broken_step(*args, **options):
         count[0] += 1
@@ -306,23 +306,23 @@ def raises(flying):
             raise ZeroDivisionError("float division by zero")
         return step(*args, **options)
 
-    flying._tracker.step = broken_step
+    flying._tracker.command = broken_step
 
 
 def gives_nan(flying):
-    step, count = flying._tracker.step, [0]
+    step, count = flying._tracker.command, [0]
 
     def broken_step(*args, **options):
         count[0] += 1
-        out = step(*args, **options)
-        return out._replace(setpoint=RateSetpoint(0.5, (0.0, NAN, 0.0))) if count[0] > 150 else out
+        setpoint = step(*args, **options)
+        return RateSetpoint(0.5, (0.0, NAN, 0.0)) if count[0] > 150 else setpoint
 
-    flying._tracker.step = broken_step
+    flying._tracker.command = broken_step
 
 
 def breaks_the_log(flying):
     """What sees all traffic raises, from the middle of the flight on."""
-    step, count = flying._tracker.step, [0]
+    step, count = flying._tracker.command, [0]
 
     def broken_step_of_the_log(*args):
         raise BufferError("the log is broken")
@@ -333,7 +333,7 @@ def breaks_the_log(flying):
             flying._wire._tap = broken_step_of_the_log
         return step(*args, **options)
 
-    flying._tracker.step = counted
+    flying._tracker.command = counted
 
 
 @pytest.mark.parametrize(

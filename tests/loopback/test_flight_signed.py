@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from flight_cases import HOVER, Stand, make_flight
 
+from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause
-from companion.flight.tracker import kernels
 from companion.link import codec
 from companion.link.framing import build_frame
 from companion.link.key_file import load_key, new_key

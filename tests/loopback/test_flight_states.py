@@ -21,10 +21,10 @@ from matrix_flight import Flown, Stage, TurnWire, flight_of
 from matrix_judge import judge
 
 from companion.flight import last_resort, loop
+from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, FlightEnded, Order, Outcome
 from companion.flight.sequence import Duty
-from companion.flight.tracker import kernels
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.load import of_flight
 from sim_link import codec

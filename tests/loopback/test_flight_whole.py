@@ -15,11 +15,12 @@ from companion import accelerate
 from companion.errors import ExitCode
 from companion.flight import connect
 from companion.flight.bundled import free_udp_port
+from companion.flight.engines import kernels
 from companion.flight.health import SystemHealth
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause
 from companion.flight.reflex import ANSWERED, UNSENDABLE
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.link.wire import Wire
 from companion.record.columns import COLUMNS
 from companion.record.flight_record import FlightRecord

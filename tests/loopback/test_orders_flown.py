@@ -13,9 +13,9 @@ import pytest
 from flight_cases import COMMAND_ACK, HOLD, HOVER, INDOOR, LAND, OFFBOARD, Flown, Stand, make_flight
 
 from companion.campaign.replay import replay
+from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import Cause, Order
-from companion.flight.tracker import kernels
 from companion.record.folder import write_configuration, write_summary
 from sim_link.modes import Mode
 

@@ -14,8 +14,8 @@ from companion.campaign.replay import replay
 from companion.cli import app
 from companion.config import Flight
 from companion.errors import InputError
+from companion.flight.engines import kernels
 from companion.flight.phases import Cause
-from companion.flight.tracker import kernels
 from companion.frames import EARTH_RADIUS_M
 from companion.record.folder import SUMMARY_FILE, write_configuration, write_summary
 from sim_link.geodesy import HOME_ALTITUDE_M, HOME_LATITUDE_DEG, HOME_LONGITUDE_DEG

@@ -7,8 +7,9 @@ from dataclasses import asdict
 from flight_cases import INDOOR, Stand, make_flight
 
 from companion.campaign.replay import replay
+from companion.flight.engines import kernels
 from companion.flight.phases import Cause
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.record.folder import write_configuration, write_summary
 from sim_link import codec
 

@@ -18,9 +18,9 @@ from flight_cases import HOVER, Stand, make_flight
 from pyulog import ULog
 
 from companion.campaign.replay import replay
+from companion.flight.engines import kernels
 from companion.flight.launch import control
 from companion.flight.phases import PHASE_NAMES
-from companion.flight.tracker import kernels
 from companion.link.vehicle_link import VehicleLink
 from companion.record import topics
 from companion.record.columns import COLUMN_INDEX, COLUMNS, DEFAULT_PHASE_NAMES

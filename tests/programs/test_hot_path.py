@@ -22,7 +22,7 @@ from companion.flight.bundled import BundledVehicle
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES
 from companion.flight.process import warm_up
-from companion.flight.tracker import kernels
+from companion.flight.engines import kernels
 from companion.link.wire import Wire
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.load import of_flight

@@ -16,7 +16,7 @@ from serve_cases import PlainTool, Serving, serving, until
 
 from companion.campaign.replay import replay
 from companion.config import build_flight, load_vehicle
-from companion.flight.tracker import kernels
+from companion.flight.engines import kernels
 from companion.ground.hosting import tuned, tuning_of
 from companion.ground.parameter_file import file_for, save_tuning
 from companion.ground.settings import Settings

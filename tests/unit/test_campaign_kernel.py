@@ -13,7 +13,7 @@ from companion.config import Output, load_flight
 from companion.control.vectors import axes
 from companion.errors import InputError
 from companion.flight.course import Course
-from companion.flight.tracker import kernels
+from companion.flight.engines import kernels
 from companion.trajectory.load import embedded, load, of_flight
 from sim_link.wind import DRAWS_PER_PERIOD, Wind, series
 from tests.unit.campaign_cases import tiny

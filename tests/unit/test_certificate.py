@@ -140,7 +140,7 @@ def test_the_delay_margin_holds_on_the_simulated_vehicle(extra_s, flies):
     """The margin says 43 ms: 30 ms of delay that nobody knows of are flown through, 60 ms are not."""
     from companion.campaign import simulate
     from companion.config import Start
-    from companion.flight.tracker import kernels
+    from companion.flight.engines import kernels
     from companion.trajectory.load import build
 
     def older(flight):

@@ -19,10 +19,10 @@ import tomlkit
 from fastcrc.crc16 import mcrf4xx
 
 from companion.config import Flight, build_flight, find, read_toml
+from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import PHASE_NAMES, Cause, Outcome
 from companion.flight.planning import Planning
-from companion.flight.tracker import kernels
 from companion.link.codec import message_formats
 from companion.link.framing import Frame, FrameParser, LinkCounters, build_frame
 from companion.link.wire import Wire

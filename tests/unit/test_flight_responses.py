@@ -11,11 +11,12 @@ from companion.control import flat
 from companion.control.output import RateSetpoint
 from companion.flight.controller import controller_of
 from companion.flight.course import Course
+from companion.flight.engines import kernels
 from companion.flight.guards import Finding, Guard, Response
 from companion.flight.phases import Autopilot, Cause, LandedState, Order, Phase
 from companion.flight.responses import respond
 from companion.flight.sequence import Duty
-from companion.flight.tracker import TrackerStep, kernels
+from companion.flight.tracker import TrackerStep
 from companion.flight.watch import Seen, Watch
 from companion.link import modes
 from companion.link.codec import Timesync

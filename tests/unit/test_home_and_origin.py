@@ -16,9 +16,10 @@ from companion.control.output import RateSetpoint
 from companion.control.types import Vec3
 from companion.flight.controller import controller_of
 from companion.flight.course import Course
+from companion.flight.engines import kernels
 from companion.flight.guards import Finding, Guard
 from companion.flight.phases import Cause, Engagement
-from companion.flight.tracker import TrackerStep, kernels
+from companion.flight.tracker import TrackerStep
 from companion.flight.watch import Seen, Watch
 from companion.frames import GeoPoint
 from companion.link.telemetry import VehicleState

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from law_cases import (
     MASS,
@@ -108,7 +108,7 @@ def test_the_lyapunov_functions_fall_as_their_closed_forms_say(start, b_hat, dra
 @pytest.mark.parametrize("start", [(0.5, -0.4, -9.2), (25.0, -15.0, -18.0)], ids=["inside", "outside"])
 def test_what_the_heading_is_told_of_the_force_is_a_direction_and_its_two_derivatives(start, monkeypatch):
     """Along the closed loop with a right estimate, with drag and with gains of which no two are alike: the derivatives
-    given against central differences of what they are derivatives of, and the errors' own rates likewise."""
+    given against central differences of what they are derivatives of."""
     drag, truth = 0.6, (0.3, -0.4, 0.2)
     p = parameters(Gains(0.7, 3.5, 2.0, 4.5, 1.3, 5.0, SIDESLIP, 1.0, 1.0, 2.0), drag)
     told = []
@@ -127,7 +127,6 @@ def test_what_the_heading_is_told_of_the_force_is_a_direction_and_its_two_deriva
     back = evaluate(state, rising(times[0]), begin, p, False, 0.0).b_hat_rate
     begin = begin._replace(b_hat=sub(truth, (h * back[0], h * back[1], h * back[2])))
     flight = fly(rising, state, begin, p, world, times, tolerance=1e-13)
-    middle = flight[1]
     samples = []
     monkeypatch.setattr(law, "heading_torque", listen)
     for t, sample in zip(times, flight, strict=True):
@@ -135,11 +134,6 @@ def test_what_the_heading_is_told_of_the_force_is_a_direction_and_its_two_deriva
     before, now, after = told
     for given_rate, a, b in ((now[1], before[0], after[0]), (now[2], before[1], after[1])):
         assert np.array(given_rate) == pytest.approx((np.array(b) - np.array(a)) / (2 * h), rel=1e-3, abs=1e-4)
-    e1_rate = sub(middle.state.v, rising(times[1]).v)
-    rates = law.error_rates(samples[1].errors, e1_rate, samples[1].b_hat_rate, p.gains, drag)
-    for k, rate in enumerate(rates, 1):
-        change = np.array(samples[2].errors[k]) - np.array(samples[0].errors[k])
-        assert np.array(rate) == pytest.approx(change / (2 * h), rel=1e-3, abs=1e-4)
 
 
 def b_hat_at(sample):
@@ -242,6 +236,7 @@ def clipped(x, low, high):
 def test_the_step_integrates_what_the_law_gives_and_cuts_it_as_section_8_says(
     state, thrust, rate, b_hat, lead, frozen, dt
 ):
+    assume(abs(norm(b_hat) - 0.9 * TIGHT.disturbance_max) > 1e-9)  # there the last digit decides about a flag
     p = parameters(PAPER_GAINS._replace(heading_kind=COMMANDED), 0.3, TIGHT)
     lags, integral, rotors = (0.05, 0.06, 0.1), np.array([1.3, 0.9, 0.4]), 0.05
     p = p._replace(model=p.model._replace(rate_lag=lags, rate_integral=tuple(integral), thrust_lag=rotors))
@@ -375,9 +370,9 @@ def test_what_the_autopilots_integral_will_add_is_taken_out_and_forgotten_slowly
 
 @given(lag=st.floats(0.005, 0.2), dt=st.floats(0.001, 0.05), w=st.floats(-3, 3), tau=st.floats(-50, 50))
 def test_the_rate_setpoint_inverts_a_first_order_loop(lag, dt, w, tau):
-    target = law.rate_setpoint(w, tau, lag, dt)
+    target = w + tau * law.lead_time(lag, dt)
     assert target + (w - target) * math.exp(-dt / lag) == pytest.approx(w + tau * dt, abs=1e-9)
-    assert law.rate_setpoint(w, tau, 0.0, dt) == w + tau * dt
+    assert law.lead_time(0.0, dt) == dt
 
 
 @given(b=vectors(1.9), y=vectors(3.0))
@@ -386,8 +381,7 @@ def test_projection_never_adds_to_the_lyapunov_function(b, y):
     bound = 2.0
     if norm(b) > bound:
         return
-    e = law.Errors((0.0,) * 3, y, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
-    rate = law.estimator_rate(e, b, 1.5, bound)
+    rate = law.projected(tuple(1.5 * x for x in y), b, bound)
     free = tuple(1.5 * x for x in y)
     size = norm(b)
     inner = (1.0 - law.PROJECTION_LAYER) * bound
@@ -403,7 +397,7 @@ def test_projection_never_adds_to_the_lyapunov_function(b, y):
 def test_the_projection_begins_at_nine_tenths_of_the_ball(b, y):
     if abs(dot(b, y)) < 1e-6 or abs(norm(b) - 1.8) < 1e-6:
         return
-    rate = law.estimator_rate(law.Errors(ZERO, y, ZERO, ZERO, ZERO), b, 1.5, 2.0)
+    rate = law.projected(tuple(1.5 * x for x in y), b, 2.0)
     assert (rate != tuple(1.5 * x for x in y)) == (norm(b) > 0.9 * 2.0 and dot(b, y) > 0.0)
 
 
@@ -411,9 +405,8 @@ def test_the_projection_begins_at_nine_tenths_of_the_ball(b, y):
 def test_the_projection_takes_away_a_share_of_what_points_outwards_and_nothing_else(b, y):
     bound, b = 2.0, np.array(b)
     inner = (1.0 - law.PROJECTION_LAYER) * bound
-    e2, e3, e4 = y, tuple(0.5 * x for x in y), tuple(-0.25 * x for x in y)
-    free = 1.5 * (np.array(e2) + np.array(e3) + np.array(e4))
-    rate = np.array(law.estimator_rate(law.Errors(ZERO, e2, e3, e4, ZERO), tuple(b), 1.5, bound))
+    free = np.array(y)
+    rate = np.array(law.projected(y, tuple(b), bound))
     size_sq, outward = b @ b, b @ free
     if size_sq <= inner**2 or outward <= 0.0:
         assert rate == pytest.approx(free)

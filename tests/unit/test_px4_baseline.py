@@ -16,8 +16,9 @@ from companion.errors import RefusedError
 from companion.flight.baseline import Px4Baseline
 from companion.flight.coast import coast_setpoint
 from companion.flight.controller import controller_of
+from companion.flight.engines import kernels
 from companion.flight.launch import prepare
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.frames import quat_from_yaw
 from companion.link import codec
 from companion.link.setpoint import (

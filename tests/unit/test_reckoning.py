@@ -21,11 +21,16 @@ from companion.flight.reckoning import Reckoner
 from companion.flight.rows import StepTiming, control_row
 from companion.flight.tracker import Target, TrackerStep
 from companion.link.telemetry import VehicleState
+from companion.trajectory import curve
 
 VEHICLE = load_vehicle("bundled")
 LIMITS = VEHICLE.limits
 RECKONER: list[Reckoner] = []
 TARGET = Target((1.0, 2.0, -3.0), (0.1, 0.2, 0.3))
+CURVE = np.zeros(curve.SHAPE + 3 * curve.WAVE)
+"""A straight line, which begins at the target."""
+CURVE[curve.KIND], CURVE[curve.SCALE], CURVE[curve.COS] = curve.WAVES, 1.0, 1.0
+CURVE[curve.SHAPE :: curve.WAVE], CURVE[curve.SHAPE + 1 :: curve.WAVE] = TARGET
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 pytestmark = pytest.mark.numba
 
@@ -58,16 +63,17 @@ class Case:
         self.z, self.m = np.zeros(reflex.SIZE, np.int64), np.zeros(fused.SIZE)
         f = self.z[reflex.FLOATS :].view(np.float64)
         f[reflex.SEEN : reflex.SEEN + 13] = *p, *self.state.v, *q, *rates
-        self.m[fused.STAMP], self.m[fused.SHARE] = self.state.t_vehicle_us * 1e-6, 0.45
+        self.m[fused.STAMP], self.m[fused.SENT] = self.state.t_vehicle_us * 1e-6, 0.45
+        self.m[fused.SENT + 1 : fused.SENT + 4] = numbers[flat.RATES]
         self.m[fused.RESULTS : fused.RESULTS + flat.RESULTS] = numbers
-        self.m[fused.TARGET : fused.TARGET + 6] = *TARGET.p, *TARGET.v
+        self.m[fused.BEGIN] = self.m[fused.STAMP]  # the curve begins at this moment
 
     def reckon(self) -> bytes | None:
         if not RECKONER:
             RECKONER.append(Reckoner())
         assert self.guards.calm is not None and self.guards.envelope is not None
         given_ = (3.0, PHASE_INDEX[Phase.TRACK], 20.5, 133.0, True, self.now_s, 0.02, *self.guards.calm)
-        return RECKONER[0].step(self.z, self.m, given_, self.guards.envelope.numbers, self.following.numbers)
+        return RECKONER[0].step(self.z, self.m, CURVE, given_, self.guards.envelope.numbers, self.following.numbers)
 
     def judged(self, off: float) -> bool:
         """Whether the guards find nothing; to be asked last."""

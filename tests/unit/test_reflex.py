@@ -18,8 +18,9 @@ from companion.config import load_vehicle
 from companion.control.history import Attitude
 from companion.control.types import State
 from companion.flight.course import Course, Timed
+from companion.flight.engines import kernels
 from companion.flight.reflex import ANSWERED, DECLINED, UNSENDABLE, Reflex
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.link import codec, direct, timesync
 from companion.link.framing import Frame, FrameParser, LinkCounters, build_frame
 from companion.link.setpoint import Setpoint, SetpointSender, UnsendableSetpoint

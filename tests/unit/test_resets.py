@@ -11,8 +11,9 @@ from companion.control import flat
 from companion.control.history import Attitude, refreshed
 from companion.control.types import Reference, State
 from companion.control.vectors import quat_exp, quat_multiply, rotate_to_inertial
+from companion.flight.engines import kernels
 from companion.flight.resets import Reset, Resets, about_vertical, jump
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.frames import quat_from_yaw
 
 ZERO = (0.0, 0.0, 0.0)

@@ -16,11 +16,12 @@ from companion.control.vectors import quat_normalise
 from companion.errors import InputError, RefusedError
 from companion.flight.adaptation import Adaptation
 from companion.flight.course import Course, at_rest
+from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import Engagement, Phase
 from companion.flight.preflight import gate_gains
 from companion.flight.retuning import POINTS, ParameterChange, Retuning, Transition, between, flown, points, unsound
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.record.flight_record import FlightRecord
 from companion.trajectory.load import load, of_flight
 

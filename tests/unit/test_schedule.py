@@ -16,13 +16,13 @@ from companion.control.sampled import spectral_radius
 from companion.control.sampled_attitude import AttitudeLoop, attitude_margins, loop_matrix
 from companion.errors import RefusedError
 from companion.flight.adaptation import Adaptation, adapted, slower
+from companion.flight.engines import kernels
 from companion.flight.findings import Verdict
 from companion.flight.loop_margins import DELAY_MARGIN_MIN_S, loop_margins, timing
 from companion.flight.measure import LinkFigures
 from companion.flight.phases import Engagement
 from companion.flight.preflight import gate_gains
 from companion.flight.schedule import choose
-from companion.flight.tracker import kernels
 from companion.trajectory.load import embedded, of_flight
 
 WELL = LinkFigures(100, 100.0, 0.020, 0.002, 0.012, 0, (), 0, 0, 0.002, 0.0005, False)

@@ -10,7 +10,7 @@ from companion.campaign.predict import gate_prediction, predict
 from companion.campaign.simulate import CSV_COLUMNS, fly_ideal, fly_sampled, write_csv
 from companion.config import Flight, SimulatedWorld, Start, load_flight, load_vehicle
 from companion.errors import InputError, RefusedError
-from companion.flight.tracker import kernels
+from companion.flight.engines import kernels
 from companion.frames import degrees
 from companion.trajectory.load import build, load
 

@@ -15,8 +15,9 @@ from companion.control.types import GRAVITY_M_S2, State
 from companion.control.vectors import quat_exp
 from companion.flight import thrust_scale
 from companion.flight.course import at_rest
+from companion.flight.engines import kernels
 from companion.flight.thrust_scale import ThrustScale
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.trajectory.load import embedded, of_flight
 
 RATE_HZ = 100.0

@@ -2,6 +2,7 @@
 
 import math
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -12,7 +13,10 @@ from companion.control.types import State
 from companion.control.vectors import quat_normalise
 from companion.flight.course import Course, Timed, at_rest
 from companion.flight.delay import CHANGE_MAX_S
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.engines import CompiledEngine, kernels
+from companion.flight.resets import Reset
+from companion.flight.retuning import flown
+from companion.flight.tracker import Tracker
 from companion.trajectory.load import load
 
 
@@ -75,6 +79,59 @@ def test_both_engines_give_the_same_numbers(output, heading):
         asked += compiled.target is None
     assert trackers[0].refreshed == trackers[1].refreshed > 10
     assert 60 < asked < 200
+
+
+@pytest.mark.numba
+@pytest.mark.parametrize("output", ["rates", "attitude"])
+def test_a_step_that_is_like_the_last_one_gives_what_one_that_is_put_together_anew_does(output):
+    """The same course object in every step lets the compiled engine go on where it was; another one each time does
+    not. Whatever changes on the way, both send and tell the same to the last bit."""
+    vehicle = load_vehicle("paper")
+    stiffer = load_vehicle("paper", {"controller": {"k1_1_s": 0.8, "k3_1_s": 3.4}})
+    course = Course(replace(load("paper"), duration_s=12.0), vehicle, (0.5, 0.0, -10.0), 0.0, None)
+    one, other = (Tracker(vehicle, output, kernels("numba")) for _ in range(2))
+    rng = random.Random(output)
+    for tracker in (one, other):
+        tracker.begin(State((0.5, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    timed, stamp, alike, again = Timed(course, 1.0), 1.0, [0], CompiledEngine.again
+
+    def counted(engine, *given):
+        alike[0] += 1
+        return again(engine, *given)
+
+    one._whole.again = counted.__get__(one._whole)
+    for i in range(6000):
+        stamp += 0.5 if i % 977 == 976 else rng.choice([0.004, 0.004, 0.008])
+        if 12.9 < stamp < 12.95:
+            stamp = 13.1  # from one curve to the next, with none between
+        state = random_state(rng, rng.choice([0.3, 0.3, 3.0]))
+        event = rng.random() if i % 20 == 0 else 1.0
+        for tracker in (one, other):
+            if i == 500:
+                tracker.retune(flown(stiffer.parameters(), tracker.parameters), 1.5)
+            if event < 0.1:
+                tracker.retime(vehicle.delay_s + 0.02 * event)
+            elif event < 0.3:
+                tracker.refresh(Attitude(stamp + 0.002, state.q, (0.1, 0.0, -0.1)))
+            elif event < 0.4:
+                tracker.carry(Reset(stamp, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), 0.1, (0.0, 0.1, 0.0)))
+            elif event < 0.45:
+                tracker.begin(state, 30.0)
+        if i == 2500:
+            plan = course.plan_pace(stamp - 1.0 + 0.6, 0.5)
+            course.change_pace(plan.work(plan.samples_max))
+        frozen = 0.45 <= event < 0.55
+        if i % 10:  # somebody else asks the same object before
+            timed.curve(stamp, one.delay_s)
+        sent = one.command(stamp, state, timed, frozen=frozen)
+        assert sent == other.command(stamp, state, Timed(course, 1.0), frozen=frozen), i
+        if i % 3 == 0:
+            told, wanted = one.last_step(), other.last_step()
+            assert told.target == wanted.target
+            assert repr(told) == repr(wanted)  # NaN and all
+    assert one.refreshed == other.refreshed > 10
+    assert one.transitions and not one.changing
+    assert (alike[0] > 1000) == (output == "rates")
 
 
 def test_a_gap_is_not_integrated_over():

@@ -1,0 +1,366 @@
+"""The arithmetic of the control steps: called as it is written, or compiled.
+
+Both engines call the very same `control.model.through` and `control.law.step`. The compiled one can make whole steps in
+one call (`flight.fused`), with the history of commands and the reference on a curve; a tracker whose steps are all
+alike asks for them with hardly more than the state.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from companion import accelerate
+from companion.control import flat, history
+from companion.control.history import Attitude
+from companion.control.law import Command, ControllerState, Evaluation, Parameters, step
+from companion.control.model import PIECE, Factors, through
+from companion.control.output import RateSetpoint
+from companion.control.types import Quat, Reference, State, Vec3, new_record
+from companion.flight import fused
+from companion.flight.course import Curve, Timed
+
+Numbers = tuple[float, ...]
+ReferenceAt = Callable[[float], Reference]
+_SENT, _RESULTS, _TARGET = 8 * fused.SENT, 8 * fused.RESULTS, 8 * fused.TARGET
+_REFERENCE, _COURSE = 8 * (fused.INPUT + flat.REFERENCE), 8 * fused.ON_CURVE
+"""Where things stand in the memory, in bytes."""
+
+
+class Stepped(NamedTuple):
+    """What one step of an engine gives to be sent and remembered."""
+
+    command: Command
+    q: Quat
+    """The attitude for which it was computed."""
+    w: Vec3
+    """The body rates for which it was computed [rad/s]."""
+
+
+class Engine(Protocol):
+    """The arithmetic of the control steps, with the controller's state."""
+
+    def begin(self, controller: ControllerState) -> None:
+        """Takes a new controller state."""
+        ...
+
+    @property
+    def controller(self) -> ControllerState:
+        """The controller's state after the last step."""
+        ...
+
+    def retune(self, parameters: Parameters) -> None:
+        """Steps with these parameters from now on; the model stays."""
+        ...
+
+    def relag(self, lags: Factors) -> None:
+        """Steps with pieces of another length from now on: their `model.factors`."""
+        ...
+
+    def step(
+        self,
+        state: State,
+        reference: Reference,
+        thrust: float,
+        pieces: Sequence[float],
+        frozen: bool,
+        integrate: bool,
+        dt_s: float,
+    ) -> Stepped:
+        """One step.
+
+        Args:
+            state: as received.
+            reference: at the time of effect.
+            thrust: that acts at the state's stamp [N].
+            pieces: what acts from the stamp to the time of effect, `model.PIECE` numbers each.
+            frozen: hold the estimator still.
+            integrate: whether the controller's state goes on.
+            dt_s: since the last step [s].
+        """
+        ...
+
+    def numbers(self) -> Numbers:
+        """All of the last step: the numbers that `control.flat` names (flat.THRUST ...)."""
+        ...
+
+
+class Kernels(NamedTuple):
+    """The engine of the control steps."""
+
+    engine: str
+    """ "python" or "numba"."""
+    build: Callable[[Parameters, Factors], Engine]
+
+
+def kernels(engine: str) -> Kernels:
+    """The arithmetic for an engine: "python", "numba", or "auto" (numba where it is installed)."""
+    chosen = accelerate.resolve(engine)
+    return Kernels(chosen, CompiledEngine if chosen == "numba" else PlainEngine)
+
+
+def stepped(n: Numbers) -> Stepped:
+    """What a step gave, from its numbers."""
+    rates, model, tau = _vec3(n[flat.RATES]), _vec3(n[flat.RATES_MODEL]), _vec3(n[flat.TAU])
+    a, b, c, d = n[flat.PREDICTED_Q]
+    command = Command(n[flat.THRUST], rates, model, tau, int(n[flat.LIMITS]))
+    return Stepped(command, (a, b, c, d), _vec3(n[flat.PREDICTED_W]))
+
+
+class PlainEngine:
+    """The control step as plain Python."""
+
+    def __init__(self, parameters: Parameters, lags: Factors) -> None:
+        self._parameters = parameters
+        model = parameters.model
+        self._vehicle = (model.mass, model.gravity, model.drag)
+        self._lags = lags
+        self._controller: ControllerState | None = None
+        self._last: tuple[Command, ControllerState, Evaluation, State] | None = None
+
+    def begin(self, controller: ControllerState) -> None:
+        """Takes a new controller state."""
+        self._controller = controller
+
+    @property
+    def controller(self) -> ControllerState:
+        """The controller's state after the last step."""
+        assert self._controller is not None
+        return self._controller
+
+    def retune(self, parameters: Parameters) -> None:
+        """Steps with these parameters from now on; the model stays."""
+        self._parameters = parameters
+
+    def relag(self, lags: Factors) -> None:
+        """Steps with pieces of another length from now on."""
+        self._lags = lags
+
+    def step(
+        self,
+        state: State,
+        reference: Reference,
+        thrust: float,
+        pieces: Sequence[float],
+        frozen: bool,
+        integrate: bool,
+        dt_s: float,
+    ) -> Stepped:
+        """One step (see Engine)."""
+        controller = self._controller
+        assert controller is not None
+        count = len(pieces) // PIECE
+        state, _ = through(state, thrust, pieces, 0, count, controller.b_hat, self._vehicle, self._lags)
+        command, after, out = step(state, reference, controller, self._parameters, frozen, dt_s)
+        if integrate:
+            self._controller = after
+        else:
+            after = controller
+        self._last = command, after, out, state
+        _, _, q, w = state
+        return new_record(Stepped, (command, q, w))
+
+    def numbers(self) -> Numbers:
+        """All of the last step (see Engine)."""
+        assert self._last is not None
+        command, after, out, state = self._last
+        return flat.results(command, after, out, self._parameters.gains.p_max, state)
+
+
+class CompiledEngine:
+    """The control step compiled as one kernel over arrays that are allocated once (`flight.fused`)."""
+
+    def __init__(self, parameters: Parameters, lags: Factors) -> None:
+        import numpy as np
+
+        self._m = m = np.zeros(fused.SIZE)
+        self._x = m[fused.INPUT : fused.CONSTANTS]
+        self._c = m[fused.CONSTANTS : fused.CONVERSION]
+        self._no_curve = np.zeros(fused.NO_CURVE)
+        self._no_history = np.zeros(history.CAPACITY)
+        self._kernel = accelerate.compile_for(fused.flight_step, m, self._no_history, self._no_curve)
+        self._find_target = accelerate.compile_for(fused.find_target, m, self._no_curve)
+        self._lags = lags
+        self.retune(parameters)
+        self._doubles: Any = m.data
+        self._bytes = m.data.cast("B")
+        self._pack = struct.Struct("14d").pack_into
+        self._pack_given = struct.Struct(f"{1 + flat.THRUST_NOW}d").pack_into
+        self._pack_reference = struct.Struct("18d").pack_into
+        self._pack_course = struct.Struct("3d").pack_into
+        self._unpack_sent = struct.Struct("4d").unpack_from
+        self._unpack = struct.Struct(f"{flat.RESULTS}d").unpack_from
+        self._unpack_target = struct.Struct("6d").unpack_from
+        self._history, self._curve = self._no_history, self._no_curve
+        self.on: Curve | None = None
+        """The curve that the last step had its reference from."""
+
+    def begin(self, controller: ControllerState) -> None:
+        """Takes a new controller state."""
+        self._x[flat.CONTROLLER : flat.PIECES] = flat.controller_numbers(controller)
+
+    @property
+    def controller(self) -> ControllerState:
+        """The controller's state after the last step."""
+        return flat.controller_of_numbers(self._x[flat.CONTROLLER : flat.PIECES].tolist())
+
+    def retune(self, parameters: Parameters) -> None:
+        """Steps with these parameters from now on; the model stays."""
+        self._c[:] = flat.constants(parameters, self._lags)
+
+    def relag(self, lags: Factors) -> None:
+        """Steps with pieces of another length from now on."""
+        self._lags = lags
+        self._c[-len(lags) :] = lags
+
+    def step(
+        self,
+        state: State,
+        reference: Reference,
+        thrust: float,
+        pieces: Sequence[float],
+        frozen: bool,
+        integrate: bool,
+        dt_s: float,
+    ) -> Stepped:
+        """One step (see Engine)."""
+        x = self._x
+        self._pack_given(self._bytes, 0, 0.0, *state.p, *state.v, *state.q, *state.w, dt_s, frozen, integrate)
+        self._doubles[fused.ON_CURVE], self.on = 0.0, None
+        self._give(reference)
+        x[flat.THRUST_NOW], x[flat.COUNT] = thrust, len(pieces) / PIECE
+        x[flat.PIECES : flat.PIECES + len(pieces)] = pieces
+        self._m[fused.WHOLE] = 0.0
+        self._kernel(self._m, self._no_history, self._no_curve)
+        return stepped(self.numbers())
+
+    def numbers(self) -> Numbers:
+        """All of the last step (see Engine)."""
+        return self._unpack(self._bytes, _RESULTS)
+
+    # -- whole steps ----------------------------------------------------------------------------------------------
+
+    def convert(self, thrust_full_n: float, curve_factor: float) -> None:
+        """Turns thrust into commands so from now on (`output.Conversion`)."""
+        self._m[fused.CONVERSION : fused.LAGS] = thrust_full_n, curve_factor
+
+    def predict(self, commands: Any, lags_s: Vec3, delay_s: float, interval_s: float, gap_max_s: float) -> None:
+        """How whole steps are made from now on.
+
+        Args:
+            commands: the history (`control.history`).
+            lags_s: of roll, pitch and yaw rate behind their setpoints [s].
+            delay_s: from a stamp to the effect of its command [s].
+            interval_s: in place of the time since the last step, where there is none to integrate over [s].
+            gap_max_s: the longest one to integrate over [s].
+        """
+        self._history = commands
+        self._m[fused.LAGS : fused.WHOLE] = *lags_s, delay_s, interval_s, gap_max_s
+
+    def fly(
+        self,
+        stamp_s: float,
+        state: State,
+        last_s: float | None,
+        reference_at: ReferenceAt,
+        attitude: Attitude | None,
+        frozen: bool,
+    ) -> None:
+        """A whole step.
+
+        Args:
+            stamp_s: vehicle time of the state [s].
+            state: as received.
+            last_s: stamp of the step before [s]; None: this is the first.
+            reference_at: the reference as a function of vehicle time [s].
+            attitude: newer than the state.
+            frozen: hold the estimator still.
+        """
+        delay_s = self._doubles[fused.DELAY]
+        if not (isinstance(reference_at, Timed) and self._refer_to_curve(reference_at, stamp_s, delay_s)):
+            self._refer(reference_at, stamp_s + delay_s)
+        self.give_attitude(attitude)
+        self._m[fused.WHOLE : fused.ON_CURVE] = 1.0, math.nan if last_s is None else last_s, frozen
+        self._pack(self._bytes, 0, stamp_s, *state.p, *state.v, *state.q, *state.w)
+        self._kernel(self._m, self._history, self._curve)
+
+    def again(self, stamp_s: float, state: State) -> RateSetpoint:
+        """A whole step like the last one, which `fly` has made: on the same curve, with nothing newer than the state.
+
+        Args:
+            stamp_s: vehicle time of the state [s].
+            state: as received.
+        """
+        (px, py, pz), (vx, vy, vz), (a, b, c, d), (x, y, z) = state
+        self._pack(self._bytes, 0, stamp_s, px, py, pz, vx, vy, vz, a, b, c, d, x, y, z)
+        self._kernel(self._m, self._history, self._curve)
+        share, x, y, z = self._unpack_sent(self._bytes, _SENT)
+        return new_record(RateSetpoint, (share, (x, y, z)))
+
+    def refer(self, timed: Timed, stamp_s: float) -> Any:
+        """Gives the next step its reference, for a state with this stamp [s]; returns the curve that it is on."""
+        delay_s = self._doubles[fused.DELAY]
+        if not self._refer_to_curve(timed, stamp_s, delay_s):
+            self._refer(timed, stamp_s + delay_s)
+        return self._curve
+
+    def _refer_to_curve(self, timed: Timed, stamp_s: float, delay_s: float) -> bool:
+        curve = timed.curve(stamp_s, delay_s)
+        if curve is None:
+            return False
+        self._pack_course(self._bytes, _COURSE, 1.0, timed.begin_s, curve.begin_s)
+        self._curve, self.on = curve.numbers, curve
+        return True
+
+    def _refer(self, reference_at: ReferenceAt, effect_s: float) -> None:
+        self._doubles[fused.ON_CURVE] = 0.0
+        self._curve, self.on = self._no_curve, None
+        self._give(reference_at(effect_s))
+
+    def _give(self, reference: Reference) -> None:
+        p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
+        self._pack_reference(self._bytes, _REFERENCE, *p, *v, *a, *j, *s, yaw, yaw_rate, yaw_acceleration)
+
+    def give_attitude(self, attitude: Attitude | None) -> None:
+        """One that is newer than the next state, if there is one."""
+        if attitude is None:
+            self._doubles[fused.ATTITUDE] = 0.0
+        else:
+            self._m[fused.ATTITUDE : fused.RESULTS] = attitude.at_s, *attitude.q, *attitude.w
+
+    @property
+    def memory(self) -> Any:
+        """What `fused.flight_step` works on."""
+        return self._m
+
+    @property
+    def curve(self) -> Any:
+        """The curve of the last step as numbers."""
+        return self._curve
+
+    @property
+    def sent(self) -> RateSetpoint:
+        """What the last whole step sends, where body rates are what is sent."""
+        share, x, y, z = self._unpack_sent(self._bytes, _SENT)
+        return RateSetpoint(share, (x, y, z))
+
+    @property
+    def target(self) -> tuple[Vec3, Vec3] | None:
+        """Position and velocity of the reference at the last stamp, where it was on a curve."""
+        if self.on is None:
+            return None
+        self._find_target(self._m, self._curve)
+        px, py, pz, vx, vy, vz = self._unpack_target(self._bytes, _TARGET)
+        return (px, py, pz), (vx, vy, vz)
+
+    @property
+    def refreshed(self) -> bool:
+        """Whether the last step predicted from an attitude newer than its state."""
+        return bool(self._doubles[fused.REFRESHED] > 0.5)
+
+
+def _vec3(numbers: Numbers) -> Vec3:
+    x, y, z = numbers
+    return x, y, z
