@@ -17,11 +17,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from companion import accelerate
+from companion.campaign.simulate import fly_sampled, start_of
 from companion.config import find, load_flight
 from companion.control.types import State
 from companion.flight.course import Course, Timed
+from companion.flight.engines import kernels
 from companion.flight.reflex import ANSWERED, Reflex
-from companion.flight.tracker import Tracker, kernels
+from companion.flight.tracker import Tracker
 from companion.link import codec
 from companion.link.framing import build_frame
 from companion.link.telemetry import Telemetry
@@ -36,6 +38,10 @@ from .common import PYTHON, NotHereError, Row, Setting, median, module_environme
 ROUNDS, CALLS = 15, 200
 FLOWN_S = 1000.0
 """Longer than any figure takes: all steps are on the trajectory."""
+MARGIN = 20
+"""States that are still under way at the end of a simulation."""
+SETTLED_S = 20.0
+"""After which the paper's flight, begun 37 m away, is on its trajectory."""
 HOW_TO_GET_ROTORPY = "RotorPy is not importable: install it somewhere and name that Python with --rotorpy-python"
 
 
@@ -90,40 +96,68 @@ def rotorpy(setting: Setting) -> Iterator[RotorPy]:
         process.communicate()
 
 
-def control_step(engine: str) -> Callable[[int], object]:
+class Flown:
+    """States of the paper's flight as it is simulated, with all limits, delays and noise, once it is on its trajectory.
+
+    A controller that is given states of another one's flight does not close the loop and drifts away from it: it begins
+    anew every CALLS states.
+
+    Args:
+        count: so many states.
+    """
+
+    def __init__(self, count: int) -> None:
+        flight = load_flight("paper")
+        self.vehicle = flight.vehicle
+        start, yaw = start_of(flight)
+        trajectory = replace(load("paper"), duration_s=FLOWN_S)
+        self.course = Course(trajectory, self.vehicle, start, yaw, (0.0, 0.0, 0.0), flight.height_min_m)
+        most_s = SETTLED_S + (count + MARGIN) / self.vehicle.link.state_rate_hz
+        rows = fly_sampled(flight, trajectory, kernels(engines()[-1]), duration_max_s=most_s).rows
+        self.states = [(row.t_s, row.state) for row in rows if row.t_s >= SETTLED_S]
+
+    def begin(self, tracker: Tracker, timed: Timed, i: int) -> tuple[int, State]:
+        """Begins anew with a state; gives its stamp [us], and the state."""
+        t_s, state = self.states[i]
+        tracker.begin(state)
+        tracker.command(t_s, state, timed)
+        return round(1e6 * t_s), state
+
+
+def control_step(engine: str, flown: Flown) -> Callable[[int], object]:
     """The control step as the loop calls it: history, prediction, reference, law, conversion into a setpoint."""
-    vehicle = load_flight("paper").vehicle
-    course = Course(replace(load("paper"), duration_s=FLOWN_S), vehicle, (0.0, 0.0, -10.0), 0.0, None)
-    state = State((0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1))
-    tracker = Tracker(vehicle, "rates", kernels(engine))
-    tracker.begin(state)
-    reference_at = Timed(course, 0.0)
-    return lambda i: tracker.step(1.0 + 0.004 * i, state, reference_at)
+    tracker, timed = Tracker(flown.vehicle, "rates", kernels(engine)), Timed(flown.course, 0.0)
+    states = flown.states
+
+    def step(i: int) -> object:
+        if i % CALLS == 0:
+            flown.begin(tracker, timed, i)
+        t_s, state = states[i + 1]
+        return tracker.command(t_s, state, timed)
+
+    return step
 
 
-def reflex_step(count: int) -> Callable[[int], object]:
-    """So many answers by reflex: from a state's datagram to the setpoint's, checks and frames included; compiled."""
-    vehicle = load_flight("paper").vehicle
-    course = Course(replace(load("paper"), duration_s=FLOWN_S), vehicle, (0.0, 0.0, -10.0), 0.0, None)
-    p, v, q, w = (0.1, 0.2, -9.9), (0.1, 1.0, 0.0), (0.99, 0.05, -0.05, 0.1), (0.1, 0.0, 0.1)
-    tracker, telemetry, reflex = Tracker(vehicle, "rates", kernels("numba")), Telemetry(1), Reflex(1, (1, 191))
-    tracker.begin(State(p, v, q, w))
-    timed, extra = Timed(course, 0.0), codec.message_formats()[codec.ODOMETRY].crc_extra
+def reflex_step(flown: Flown) -> Callable[[int], object]:
+    """Answers by reflex: from a state's datagram to the setpoint's, checks and frames included; compiled."""
+    tracker, telemetry = Tracker(flown.vehicle, "rates", kernels("numba")), Telemetry(1)
+    reflex, timed = Reflex(1, (1, 191)), Timed(flown.course, 0.0)
+    extra = codec.message_formats()[codec.ODOMETRY].crc_extra
     layout = struct.Struct("<Q13f168x4Bb")
     datagrams = []
-    for i in range(count):
-        payload = layout.pack(1_000_000 + 4_000 * i, p[0] + 1e-4 * i, *p[1:], *q, *v, *w, 1, 1, 0, 8, 50)
+    for i, (t_s, (p, v, q, w)) in enumerate(flown.states):
+        payload = layout.pack(round(1e6 * t_s), *p, *q, *v, *w, 1, 1, 0, 8, 50)
         datagrams.append(build_frame(codec.ODOMETRY, payload, i & 0xFF, 1, 1, extra))
-    tracker.step(0.996, State(p, v, q, w), timed)
-    telemetry.took(996_000, (p, v, q, w))
 
     def answer(i: int) -> bytes:
-        last_us = 996_000 + 4_000 * i
-        given = (i & 0xFF, i & 0xFF, 1, last_us, last_us, -1, 0, 500_000)
-        assert telemetry.numbers is not None
-        if not reflex.take(datagrams[i], given, telemetry.numbers) or tracker.answer(reflex, timed) != ANSWERED:
+        if i % CALLS == 0:
+            telemetry.took(*flown.begin(tracker, timed, i))
+        last_us, seq = telemetry.last_t_vehicle_us, (i + 1) & 0xFF
+        given = (seq, seq, 1, last_us, last_us, -1, 0, 500_000)
+        if not reflex.take(datagrams[i + 1], given, telemetry.numbers) or tracker.answer(reflex, timed) != ANSWERED:
             raise RuntimeError("not answered by reflex")
-        state, telemetry.numbers = reflex.told()
+        state, numbers = reflex.told()
+        telemetry.took(state.t_vehicle_us, numbers)
         tracker.answered(state.t_vehicle_us * 1e-6, State(*state[1:5]))
         return reflex.output.tobytes()
 
@@ -144,10 +178,11 @@ def engines() -> list[str]:
 
 def control_rows(setting: Setting) -> list[Row]:
     """The control step against SE3Control.update."""
-    calls = {engine: control_step(engine) for engine in engines()}
     rounds = 3 if setting.quick else ROUNDS
+    flown = Flown(300 + rounds * CALLS)
+    calls = {engine: control_step(engine, flown) for engine in engines()}
     if "numba" in calls:
-        calls["reflex"] = reflex_step(300 + rounds * CALLS)
+        calls["reflex"] = reflex_step(flown)
     for call in calls.values():
         times_us(call, 300)
     ours: dict[str, list[float]] = {engine: [] for engine in calls}
@@ -240,22 +275,23 @@ def instruction_rows(setting: Setting) -> list[Row]:
 
 def growth_rows(setting: Setting) -> list[Row]:
     """Cost over the number of vehicles and over the time flown: a share of 1 is linear."""
-    engine = engines()[-1]
+    engine, rounds = engines()[-1], 60 if setting.quick else 400
+    flown = Flown(40_000)
     per_vehicle, per_second = [], []
     for count in (1, 4, 16):
         setting.say(f"growth: {count} vehicles")
         calls = [physics_steps(engine, 4) for _ in range(count)]
-        steps = [control_step(engine) for _ in range(count)]
+        steps = [control_step(engine, flown) for _ in range(count)]
         for i in range(20):
             for call, step in zip(calls, steps, strict=True):
                 call(i), step(i)
         one_round = times_us(
             lambda i, c=calls, s=steps: [(call(i), step(i)) for call, step in zip(c, s, strict=True)],  # type: ignore[misc]
-            60 if setting.quick else 400,
+            rounds,
             20,
         )
         per_vehicle.append(median(one_round) / count)
-    step = control_step(engine)
+    step = control_step(engine, flown)
     for begin in range(0, 40_000, 10_000):
         per_second.append(median(times_us(step, 2000 if setting.quick else 10_000, begin)))
     vehicles = ", ".join(f"{x / per_vehicle[0]:.2f}" for x in per_vehicle)
@@ -269,6 +305,7 @@ def growth_rows(setting: Setting) -> list[Row]:
 if __name__ == "__main__":
     import sys
 
-    step_of = control_step(sys.argv[1])
-    for index in range(int(sys.argv[2])):
+    number = int(sys.argv[2])
+    step_of = control_step(sys.argv[1], Flown(number))
+    for index in range(number):
         step_of(index)
