@@ -15,6 +15,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from companion import accelerate
 from companion.campaign.simulate import fly_sampled, start_of
@@ -103,10 +104,11 @@ class Flown:
     anew every CALLS states.
 
     Args:
-        count: so many states.
+        count: so many states, rounded up to whole CALLS; after them they come again.
     """
 
     def __init__(self, count: int) -> None:
+        self.count = count = CALLS * -(-count // CALLS)
         flight = load_flight("paper")
         self.vehicle = flight.vehicle
         start, yaw = start_of(flight)
@@ -124,21 +126,37 @@ class Flown:
         return round(1e6 * t_s), state
 
 
-def control_step(engine: str, flown: Flown) -> Callable[[int], object]:
+class Steps(NamedTuple):
+    """Control steps through the states of a flight."""
+
+    begin: Callable[[int], None]
+    """Begins anew with the state of this index."""
+    step: Callable[[int], object]
+    """The step for the state behind the one of this index."""
+
+    def times_us(self, count: int, of: int) -> list[float]:
+        """How long each of so many steps takes [us], from the first one on, through `of` states over and over."""
+        times: list[float] = []
+        while len(times) < count:
+            i = len(times) % of
+            self.begin(i)
+            times += times_us(self.step, min(CALLS, count - len(times)), i)
+        return times
+
+
+def control_steps(engine: str, flown: Flown) -> Steps:
     """The control step as the loop calls it: history, prediction, reference, law, conversion into a setpoint."""
     tracker, timed = Tracker(flown.vehicle, "rates", kernels(engine)), Timed(flown.course, 0.0)
-    states = flown.states
+    states, command = flown.states, tracker.command
 
     def step(i: int) -> object:
-        if i % CALLS == 0:
-            flown.begin(tracker, timed, i)
         t_s, state = states[i + 1]
-        return tracker.command(t_s, state, timed)
+        return command(t_s, state, timed)
 
-    return step
+    return Steps(lambda i: (flown.begin(tracker, timed, i), None)[1], step)
 
 
-def reflex_step(flown: Flown) -> Callable[[int], object]:
+def reflex_steps(flown: Flown) -> Steps:
     """Answers by reflex: from a state's datagram to the setpoint's, checks and frames included; compiled."""
     tracker, telemetry = Tracker(flown.vehicle, "rates", kernels("numba")), Telemetry(1)
     reflex, timed = Reflex(1, (1, 191)), Timed(flown.course, 0.0)
@@ -150,18 +168,17 @@ def reflex_step(flown: Flown) -> Callable[[int], object]:
         datagrams.append(build_frame(codec.ODOMETRY, payload, i & 0xFF, 1, 1, extra))
 
     def answer(i: int) -> bytes:
-        if i % CALLS == 0:
-            telemetry.took(*flown.begin(tracker, timed, i))
-        last_us, seq = telemetry.last_t_vehicle_us, (i + 1) & 0xFF
+        last_us, before, seq = telemetry.last_t_vehicle_us, telemetry.numbers, (i + 1) & 0xFF
+        assert last_us is not None and before is not None
         given = (seq, seq, 1, last_us, last_us, -1, 0, 500_000)
-        if not reflex.take(datagrams[i + 1], given, telemetry.numbers) or tracker.answer(reflex, timed) != ANSWERED:
+        if not reflex.take(datagrams[i + 1], given, before) or tracker.answer(reflex, timed) != ANSWERED:
             raise RuntimeError("not answered by reflex")
         state, numbers = reflex.told()
         telemetry.took(state.t_vehicle_us, numbers)
         tracker.answered(state.t_vehicle_us * 1e-6, State(*state[1:5]))
         return reflex.output.tobytes()
 
-    return answer
+    return Steps(lambda i: telemetry.took(*flown.begin(tracker, timed, i)), answer)
 
 
 def physics_steps(engine: str, count: int) -> Callable[[int], object]:
@@ -178,22 +195,20 @@ def engines() -> list[str]:
 
 def control_rows(setting: Setting) -> list[Row]:
     """The control step against SE3Control.update."""
-    rounds = 3 if setting.quick else ROUNDS
-    flown = Flown(300 + rounds * CALLS)
-    calls = {engine: control_step(engine, flown) for engine in engines()}
-    if "numba" in calls:
-        calls["reflex"] = reflex_step(flown)
-    for call in calls.values():
-        times_us(call, 300)
-    ours: dict[str, list[float]] = {engine: [] for engine in calls}
+    flown = Flown(CALLS)  # few, so that they stay in the cache, where a state that has just come is
+    steps = {engine: control_steps(engine, flown) for engine in engines()}
+    if "numba" in steps:
+        steps["reflex"] = reflex_steps(flown)
+    ours: dict[str, list[float]] = {engine: [] for engine in steps}
     theirs: list[float] = []
     with rotorpy(setting) as other:
         other.ask("controller", 100)
-        for i in range(rounds):
+        for i in range(3 if setting.quick else ROUNDS):
             setting.say(f"control step, round {i + 1}")
             theirs += other.ask("controller", CALLS)
-            for engine, call in calls.items():
-                ours[engine] += times_us(call, CALLS, 300 + i * CALLS)
+            for engine, of in steps.items():
+                # As long as the other's turn, roughly: 200 calls would be over before the processor is warm again.
+                ours[engine] += of.times_us(CALLS * (5 if engine == "python" else 25), flown.count)
     a, b = p50_p99(theirs)
     rows = []
     for engine, reach in (("python", 10.0), ("numba", 80.0)):
@@ -281,19 +296,21 @@ def growth_rows(setting: Setting) -> list[Row]:
     for count in (1, 4, 16):
         setting.say(f"growth: {count} vehicles")
         calls = [physics_steps(engine, 4) for _ in range(count)]
-        steps = [control_step(engine, flown) for _ in range(count)]
+        steps = [control_steps(engine, flown) for _ in range(count)]
+        for of in steps:
+            of.begin(0)
         for i in range(20):
-            for call, step in zip(calls, steps, strict=True):
-                call(i), step(i)
+            for call, of in zip(calls, steps, strict=True):
+                call(i), of.step(i)
         one_round = times_us(
-            lambda i, c=calls, s=steps: [(call(i), step(i)) for call, step in zip(c, s, strict=True)],  # type: ignore[misc]
+            lambda i, c=calls, s=steps: [(call(i), of.step(i)) for call, of in zip(c, s, strict=True)],  # type: ignore[misc]
             rounds,
             20,
         )
         per_vehicle.append(median(one_round) / count)
-    step = control_step(engine, flown)
+    times = control_steps(engine, flown).times_us(40_000, flown.count)
     for begin in range(0, 40_000, 10_000):
-        per_second.append(median(times_us(step, 2000 if setting.quick else 10_000, begin)))
+        per_second.append(median(times[begin : begin + 10_000]))
     vehicles = ", ".join(f"{x / per_vehicle[0]:.2f}" for x in per_vehicle)
     time_flown = ", ".join(f"{x / per_second[0]:.2f}" for x in per_second)
     return [
@@ -306,6 +323,4 @@ if __name__ == "__main__":
     import sys
 
     number = int(sys.argv[2])
-    step_of = control_step(sys.argv[1], Flown(number))
-    for index in range(number):
-        step_of(index)
+    control_steps(sys.argv[1], Flown(number)).times_us(number, number)
