@@ -2,7 +2,9 @@
 
 Unasked, for every vehicle whose time passes by itself: a priority above ordinary processes, where that is permitted.
 Without it a process that wakes in the middle of a step takes the core until the scheduler's next tick, 4 ms later: with
-a busy ground link the step's 99th percentile is two to three times what it is without.
+a busy ground link the step's 99th percentile is two to three times what it is without. And a way out of it for others:
+`make_way` when a setpoint has gone out. On a computer with two cores, shared with the vehicle that it goes to, its 99th
+percentile there is 0.6 of what it is without.
 
 With `--realtime`, and each said: a scheduling class above everything ordinary, memory that is not swapped out, timers
 without slack, a core to stay on. Nothing of it is needed for a flight.
@@ -58,6 +60,15 @@ def take_priority() -> bool:
     except (OSError, AttributeError):  # not permitted; not Linux
         return False
     return True
+
+
+def make_way() -> None:
+    """Lets those go first who wait for this core: a setpoint is out, and what is left to do with its step can wait.
+
+    A vehicle or a router on the same computer may wake where this thread still runs, and is behind it in priority.
+    """
+    with contextlib.suppress(AttributeError):  # not everywhere
+        os.sched_yield()
 
 
 def take_core_of_two(port: int) -> None:

@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import replace
 
+from companion import realtime
 from companion.config import Flight
 from companion.control.history import Attitude
 from companion.control.output import PositionSetpoint, Setpoint
@@ -634,6 +635,8 @@ class FlightLoop:
             self._lost += 1
             return
         self._sent_ns = time.monotonic_ns()
+        if not self._peer.paced:
+            realtime.make_way()
         self._flown(state, self._tracker.last_step(), skipped, arrival_ns)
 
     def _use_at_once(self, datagrams: list[Datagram]) -> int:
@@ -702,6 +705,8 @@ class FlightLoop:
         sender = system, AUTOPILOT_COMPONENT
         sent = self._wire.answer(datagram, wall_ns, sender, 2 if paced else 1, frames)
         self._sent_ns = time.monotonic_ns()
+        if not paced:
+            realtime.make_way()
         self._reflexed = True
         state = self._take_over(reflex, tracker, wall_ns)
         if sent:

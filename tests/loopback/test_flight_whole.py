@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flight_cases import COMMAND_LONG, HOVER, INDOOR, Stand, make_flight
 
-from companion import accelerate
+from companion import accelerate, realtime
 from companion.errors import ExitCode
 from companion.flight import connect
 from companion.flight.bundled import free_udp_port
@@ -174,6 +174,7 @@ def test_a_flight_does_not_show_which_states_were_answered_by_reflex(tmp_path, m
         return False
 
     flights, setpoints = [], []
+    monkeypatch.setattr(realtime, "make_way", lambda: pytest.fail("a vehicle in lockstep has a core of its own"))
     for way in (counted, never):
         monkeypatch.setattr(FlightLoop, "_answer_at_once", way)
         with Stand(flight, tmp_path) as stand:

@@ -18,6 +18,7 @@ import pytest
 import tomlkit
 from fastcrc.crc16 import mcrf4xx
 
+from companion import realtime
 from companion.config import Flight, build_flight, find, read_toml
 from companion.flight.engines import kernels
 from companion.flight.loop import FlightLoop
@@ -486,6 +487,8 @@ def test_states_with_attitudes_behind_them_are_answered_by_reflex(
         by_reflex[0] += done
         return done
 
+    out: list[int] = []
+    monkeypatch.setattr(realtime, "make_way", lambda: out.append(len(stage.setpoints(-math.inf))))
     for way in (counted, lambda loop, *given: False):
         monkeypatch.setattr(FlightLoop, "_answer_at_once", way)
         stage = make_wire(((0.0, 0.0, -20.0), 0.0))
@@ -495,6 +498,9 @@ def test_states_with_attitudes_behind_them_are_answered_by_reflex(
         assert outcome.cause is Cause.COMPLETED, outcome.sentence
         setpoints = [(t, m.to_dict()) for t, m in stage.setpoints(-math.inf)]
         flown.append((setpoints, record.rows.tobytes(), outcome.vehicle, str(wire.counters), outcome.rejected_states))
+        # whoever waits for a setpoint goes before what is left to do with its step
+        assert len(out) >= len(record) and out == sorted(set(out)), "one more was out each time"
+        out.clear()
     assert by_reflex[0] > 0.4 * len(record)  # at the others something else came before the state
     assert flown[0] == flown[1]
     assert (flown[0][2]["refreshed_states"] > 0.8 * len(record)) == (age_us > 0)
