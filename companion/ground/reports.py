@@ -108,19 +108,19 @@ class Reports:
         standing = self._standing()
         since_s = now_s - self._begun_s
         values = {
-            ERROR: standing.error_m,
             LYAPUNOV: standing.lyapunov,
             TO_GO: standing.to_go_s,
             TRACK_TIME: standing.track_s,
+            ERROR: standing.error_m,  # the last one: whoever has it has the others
         }
-        found = [
+        found = []
+        if standing.disturbance_m_s2 is not None:
+            found.append((DEBUG_VECT, encode_debug_vect(int(since_s * 1e6), DISTURBANCE, standing.disturbance_m_s2)))
+        return found + [
             (NAMED_VALUE_FLOAT, encode_named_value(int(since_s * 1e3), name, value))
             for name, value in values.items()
             if value is not None
         ]
-        if standing.disturbance_m_s2 is not None:
-            found.append((DEBUG_VECT, encode_debug_vect(int(since_s * 1e6), DISTURBANCE, standing.disturbance_m_s2)))
-        return found
 
     def _everywhere(self, msgid: int, payload: bytes) -> None:
         for port in self._ports:
