@@ -380,7 +380,7 @@ class Tracker(Stepping):
             b_hat = scale_vector(bound / size, b_hat)
         heading = HeadingState(about_vertical(yaw, heading.r2d), about_vertical(yaw, heading.forward), heading.held)
         self._engine.begin(controller._replace(b_hat=b_hat, heading=heading))
-        self._attitude = None
+        self._attitude = self._same = None  # an answer that was declined has given it already
         if self._scale is not None:
             self._scale.interrupt()
 

@@ -134,6 +134,27 @@ def test_a_step_that_is_like_the_last_one_gives_what_one_that_is_put_together_an
     assert (alike[0] > 1000) == (output == "rates")
 
 
+@pytest.mark.numba
+def test_an_attitude_of_before_a_reset_is_not_used_after_it():
+    """Also where an answer by reflex had it already, and was declined."""
+    vehicle = load_vehicle("paper")
+    course = Course(load("paper"), vehicle, (0.5, 0.0, -10.0), 0.0, None)
+    state = State((0.5, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    sent, timed = [], Timed(course, 1.0)
+    for given in (True, False):
+        tracker = Tracker(vehicle, "rates", kernels("numba"))
+        tracker.begin(state)
+        for i in range(5):
+            tracker.command(1.0 + 0.004 * i, state, timed)
+        if given:
+            attitude = Attitude(1.023, quat_normalise((1.0, 0.02, 0.0, 0.0)), (0.1, 0.0, 0.0))
+            tracker.refresh(attitude)
+            tracker._whole.give_attitude(attitude)
+        tracker.carry(Reset(1.02, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0)))
+        sent.append(tracker.command(1.02, state, timed))
+    assert sent[0] == sent[1]
+
+
 def test_a_gap_is_not_integrated_over():
     vehicle = load_vehicle("paper")
     tracker = Tracker(vehicle, "rates", kernels("python"))
