@@ -171,7 +171,7 @@ def points(old: Parameters, new: Parameters) -> list[Parameters]:
 
 
 class Turning:
-    """Two engines that differ in the kind of heading; implements `tracker.Engine`.
+    """Two engines that differ in the kind of heading; implements `engines.Engine`.
 
     Their other axes are the same numbers, since thrust, roll and pitch do not depend on the heading. The new one wants
     its direction from its first step on: what it asks of the yaw axis is bounded, and its share grows; a wanted
