@@ -92,8 +92,7 @@ def follow(h: MutableSequence[float], stamp_s: float) -> None:
     if math.isnan(last_s):
         return
     begin_at, end = int(h[BEGIN]), int(h[END])
-    at_s = h[begin_at]
-    at_s = max(at_s, last_s)
+    at_s = max(last_s, h[begin_at])
     thrust = h[THRUST]
     while True:
         following = begin_at + COMMAND
@@ -125,7 +124,7 @@ def gather(h: MutableSequence[float], stamp_s: float, out: MutableSequence[float
     if count == 0:
         return 0
     length_s = h[LENGTH]
-    k, least_s = 1.0 / length_s, SHORTEST_S
+    k = 1.0 / length_s
     i, end = int(h[BEGIN]), int(h[END])
     at_s, edge_s = stamp_s, stamp_s + length_s
     thrust = x = y = z = 0.0
@@ -134,7 +133,7 @@ def gather(h: MutableSequence[float], stamp_s: float, out: MutableSequence[float
         t, p, q, r = h[i + 1], h[i + 2], h[i + 3], h[i + 4]
         i += COMMAND
         until_s = h[i] if i < end else math.inf
-        while until_s > edge_s - least_s:  # the piece ends within this command
+        while until_s > edge_s - SHORTEST_S:  # the piece ends within this command
             share_s = edge_s - at_s
             out[at] = k * (thrust + share_s * t)
             out[at + 1] = k * (x + share_s * p)

@@ -238,7 +238,7 @@ def evaluate(
 
     # b_hat' (33), and b_hat'' = Gamma (e2' + e3' + e4') with b_tilde taken as zero, which only the heading needs; it is
     # left out while the projection bends b_hat'
-    b_hat_rate = free = (0.0, 0.0, 0.0)
+    b_hat_rate = (0.0, 0.0, 0.0)
     b0_rate = b1_rate = b2_rate = 0.0
     x2 = y2 = z2 = 0.0
     if not frozen and gamma > 0.0:
@@ -270,8 +270,7 @@ def evaluate(
         x * w2 - y * w1 - m_c1 * (r20 * h0 + r21 * h1 + r22 * h2),
         thrust * (w1 * w1 + w2 * w2) + m_c1 * (r30 * h0 + r31 * h1 + r32 * h2),
     )
-    divisor = limits.thrust_min
-    divisor = max(divisor, thrust)
+    divisor = max(thrust, limits.thrust_min)
 
     # F/m with its derivatives: the direction that the thrust will have with no error
     force = (f0, f1, f2), (b0_rate - j0, b1_rate - j1, b2_rate - j2), (x2 - s0, y2 - s1, z2 - s2)

@@ -6,17 +6,16 @@ from collections.abc import Callable
 from typing import Protocol
 
 from companion.config import Flight
-from companion.control.output import Setpoint
 from companion.control.types import State
 from companion.flight.baseline import Px4Baseline
 from companion.flight.calibration import Calibrator
-from companion.flight.engines import Kernels, ReferenceAt
+from companion.flight.engines import Kernels
 from companion.flight.phases import Autopilot
 from companion.flight.resets import Reset
-from companion.flight.tracker import Tracker, TrackerStep
+from companion.flight.tracker import Stepping, Tracker
 
 
-class Controller(Protocol):
+class Controller(Stepping, Protocol):
     """Answers every state with one setpoint; its time is the vehicle's, and it knows nothing of sockets."""
 
     def begin(self, state: State, thrust_n: float | None = None) -> None:
@@ -26,25 +25,6 @@ class Controller(Protocol):
             state: the vehicle now.
             thrust_n: the thrust that acts [N]; None: unknown.
         """
-        ...
-
-    def command(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> Setpoint:
-        """The setpoint for one state.
-
-        Args:
-            stamp_s: vehicle time of the state [s].
-            state: as received.
-            reference_at: the reference as a function of vehicle time [s].
-            frozen: hold what is estimated still.
-        """
-        ...
-
-    def last_step(self) -> TrackerStep:
-        """All that is known of the last step; for what can wait until its setpoint is out."""
-        ...
-
-    def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
-        """Both at once, where nobody waits for the setpoint."""
         ...
 
     def foresee(self, stamp_s: float) -> tuple[State, float] | None:

@@ -278,7 +278,7 @@ class Timed:
 
     def _take(self, curve: Curve | None) -> None:
         self.on = curve
-        """The curve of the last answer."""
+        """The curve of the last answer; None: there was none."""
         self._from_s, self._length_s = (0.0, -math.inf) if curve is None else (curve.begin_s, curve.duration_s)
 
     def __call__(self, t_s: float) -> Reference:
@@ -297,15 +297,14 @@ class Timed:
 
         It goes by the times alone: a replay, which knows all changes of the pace from its beginning, takes the same.
         """
-        if self.goes_on(stamp_s, delay_s):
-            return self.on
-        last = self.on
-        for other in self.course.curves:
-            self._take(other)
-            if self.goes_on(stamp_s, delay_s):
-                return other
-        self._take(last)
-        return None
+        if not self.goes_on(stamp_s, delay_s):
+            for other in self.course.curves:
+                self._take(other)
+                if self.goes_on(stamp_s, delay_s):
+                    break
+            else:
+                self._take(None)
+        return self.on
 
 
 class _OwnPace:

@@ -193,9 +193,11 @@ class CompiledEngine:
         self._unpack_sent = struct.Struct("4d").unpack_from
         self._unpack = struct.Struct(f"{flat.RESULTS}d").unpack_from
         self._unpack_target = struct.Struct("6d").unpack_from
-        self._history, self._curve = self._no_history, self._no_curve
+        self._history = self._no_history
         self.on: Curve | None = None
         """The curve that the last step had its reference from."""
+        self.curve: Any = self._no_curve
+        """The same as numbers; not read where there is none."""
 
     def begin(self, controller: ControllerState) -> None:
         """Takes a new controller state."""
@@ -278,13 +280,11 @@ class CompiledEngine:
             attitude: newer than the state.
             frozen: hold the estimator still.
         """
-        delay_s = self._doubles[fused.DELAY]
-        if not (isinstance(reference_at, Timed) and self._refer_to_curve(reference_at, stamp_s, delay_s)):
-            self._refer(reference_at, stamp_s + delay_s)
+        self.refer(reference_at, stamp_s)
         self.give_attitude(attitude)
         self._m[fused.WHOLE : fused.ON_CURVE] = 1.0, math.nan if last_s is None else last_s, frozen
         self._pack(self._bytes, 0, stamp_s, *state.p, *state.v, *state.q, *state.w)
-        self._kernel(self._m, self._history, self._curve)
+        self._kernel(self._m, self._history, self.curve)
 
     def again(self, stamp_s: float, state: State) -> RateSetpoint:
         """A whole step like the last one, which `fly` has made: on the same curve, with nothing newer than the state.
@@ -295,29 +295,20 @@ class CompiledEngine:
         """
         (px, py, pz), (vx, vy, vz), (a, b, c, d), (x, y, z) = state
         self._pack(self._bytes, 0, stamp_s, px, py, pz, vx, vy, vz, a, b, c, d, x, y, z)
-        self._kernel(self._m, self._history, self._curve)
-        share, x, y, z = self._unpack_sent(self._bytes, _SENT)
-        return new_record(RateSetpoint, (share, (x, y, z)))
+        self._kernel(self._m, self._history, self.curve)
+        return self.sent
 
-    def refer(self, timed: Timed, stamp_s: float) -> Any:
-        """Gives the next step its reference, for a state with this stamp [s]; returns the curve that it is on."""
+    def refer(self, reference_at: ReferenceAt, stamp_s: float) -> None:
+        """Gives the next step its reference, for a state with this stamp [s]: a curve where there is one."""
         delay_s = self._doubles[fused.DELAY]
-        if not self._refer_to_curve(timed, stamp_s, delay_s):
-            self._refer(timed, stamp_s + delay_s)
-        return self._curve
-
-    def _refer_to_curve(self, timed: Timed, stamp_s: float, delay_s: float) -> bool:
-        curve = timed.curve(stamp_s, delay_s)
-        if curve is None:
-            return False
-        self._pack_course(self._bytes, _COURSE, 1.0, timed.begin_s, curve.begin_s)
-        self._curve, self.on = curve.numbers, curve
-        return True
-
-    def _refer(self, reference_at: ReferenceAt, effect_s: float) -> None:
-        self._doubles[fused.ON_CURVE] = 0.0
-        self._curve, self.on = self._no_curve, None
-        self._give(reference_at(effect_s))
+        timed = reference_at if isinstance(reference_at, Timed) else None
+        self.on = curve = None if timed is None else timed.curve(stamp_s, delay_s)
+        if timed is None or curve is None:
+            self._doubles[fused.ON_CURVE], self.curve = 0.0, self._no_curve
+            self._give(reference_at(stamp_s + delay_s))
+        else:
+            self._pack_course(self._bytes, _COURSE, 1.0, timed.begin_s, curve.begin_s)
+            self.curve = curve.numbers
 
     def _give(self, reference: Reference) -> None:
         p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
@@ -336,22 +327,17 @@ class CompiledEngine:
         return self._m
 
     @property
-    def curve(self) -> Any:
-        """The curve of the last step as numbers."""
-        return self._curve
-
-    @property
     def sent(self) -> RateSetpoint:
         """What the last whole step sends, where body rates are what is sent."""
         share, x, y, z = self._unpack_sent(self._bytes, _SENT)
-        return RateSetpoint(share, (x, y, z))
+        return new_record(RateSetpoint, (share, (x, y, z)))
 
     @property
     def target(self) -> tuple[Vec3, Vec3] | None:
         """Position and velocity of the reference at the last stamp, where it was on a curve."""
         if self.on is None:
             return None
-        self._find_target(self._m, self._curve)
+        self._find_target(self._m, self.curve)
         px, py, pz, vx, vy, vz = self._unpack_target(self._bytes, _TARGET)
         return (px, py, pz), (vx, vy, vz)
 

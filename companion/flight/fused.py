@@ -20,8 +20,6 @@ from companion.control.types import State
 from companion.flight.prediction import PIECES_MAX
 from companion.trajectory.curve import MOVED, on_curve
 
-RATES = flat.RATES.start
-
 # where things stand among the numbers
 STAMP = 0
 """Vehicle time of the state [s]."""
@@ -65,6 +63,7 @@ TARGET = REFRESHED + 1
 SIZE = TARGET + 6
 NO_CURVE = MOVED + 3
 """Numbers of a curve that is never read."""
+_RATES = RESULTS + flat.RATES.start
 
 
 def flight_step(m: Any, h: MutableSequence[float], r: Sequence[float]) -> None:
@@ -94,8 +93,7 @@ def flight_step(m: Any, h: MutableSequence[float], r: Sequence[float]) -> None:
         i = flat.THRUST  # the rates of the model stand behind it
         remember(h, stamp_s + m[DELAY], y[i], y[i + 1], y[i + 2], y[i + 3])
     m[SENT] = thrust_fraction(y[flat.THRUST], m[CONVERSION], m[CONVERSION + 1])
-    i = RESULTS + RATES
-    m[SENT + 1], m[SENT + 2], m[SENT + 3] = m[i], m[i + 1], m[i + 2]
+    m[SENT + 1], m[SENT + 2], m[SENT + 3] = m[_RATES], m[_RATES + 1], m[_RATES + 2]
 
 
 def _time(m: Any, x: MutableSequence[float], stamp_s: float) -> None:

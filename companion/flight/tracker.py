@@ -8,9 +8,8 @@ that is known of the step when it is asked for.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from companion.config import Vehicle
 from companion.control import flat
@@ -81,16 +80,23 @@ class TrackerStep(NamedTuple):
         return _vec3(self.numbers[flat.B_HAT])
 
 
-class Stepping(ABC):
-    """A controller: answers every state with one setpoint, and tells the rest when it is asked."""
+class Stepping(Protocol):
+    """Answers every state with one setpoint, and tells the rest when it is asked."""
 
-    @abstractmethod
     def command(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> Setpoint:
-        """The setpoint for one state."""
+        """The setpoint for one state.
 
-    @abstractmethod
+        Args:
+            stamp_s: vehicle time of the state [s].
+            state: as received.
+            reference_at: the reference as a function of vehicle time [s].
+            frozen: hold what is estimated still.
+        """
+        ...
+
     def last_step(self) -> TrackerStep:
-        """All that is known of the last step."""
+        """All that is known of the last step; for what can wait until its setpoint is out."""
+        ...
 
     def step(self, stamp_s: float, state: State, reference_at: ReferenceAt, *, frozen: bool = False) -> TrackerStep:
         """Both at once, where nobody waits for the setpoint."""
@@ -255,8 +261,8 @@ class Tracker(Stepping):
         if whole is None or self._last_s is None or not (same and self._by_rates):
             return DECLINED
         whole.give_attitude(self._attitude)
-        r = whole.refer(timed, reflex.stamp_us * 1e-6)
-        return reflex.run(whole.memory, self._prediction.numbers, r)
+        whole.refer(timed, reflex.stamp_us * 1e-6)
+        return reflex.run(whole.memory, self._prediction.numbers, whole.curve)
 
     def answered(self, stamp_s: float, state: State) -> None:
         """The step that `answer` has made was for this state."""

@@ -129,7 +129,7 @@ class Flown:
 class Steps(NamedTuple):
     """Control steps through the states of a flight."""
 
-    begin: Callable[[int], None]
+    begin: Callable[[int], object]
     """Begins anew with the state of this index."""
     step: Callable[[int], object]
     """The step for the state behind the one of this index."""
@@ -153,7 +153,7 @@ def control_steps(engine: str, flown: Flown) -> Steps:
         t_s, state = states[i + 1]
         return command(t_s, state, timed)
 
-    return Steps(lambda i: (flown.begin(tracker, timed, i), None)[1], step)
+    return Steps(lambda i: flown.begin(tracker, timed, i), step)
 
 
 def reflex_steps(flown: Flown) -> Steps:
