@@ -134,7 +134,8 @@ class Signer:
         self._hash = sha256(key.secret)
         self._link = bytes((times.link_id,))
         # From here on time passes by the monotonic clock: a step of the machine's clock must not reach a flight.
-        self._zero = time_now() - time.monotonic_ns() // NS_PER_UNIT
+        # In ns, as two times that were rounded down to units may be one unit ahead of the clock together.
+        self._zero_ns = time.time_ns() - EPOCH_S * UNITS_PER_S * NS_PER_UNIT - time.monotonic_ns()
 
     @property
     def outdated(self) -> int:
@@ -154,7 +155,7 @@ class Signer:
 
     def now(self) -> int:
         """Signing time: the clock, or what others have told, whichever is later."""
-        return max(self.times.newest, self._zero + time.monotonic_ns() // NS_PER_UNIT)
+        return max(self.times.newest, (self._zero_ns + time.monotonic_ns()) // NS_PER_UNIT)
 
     def sign(self, unsigned: bytes) -> bytes:
         """The 13 bytes that end a frame which has the signed flag set.
@@ -163,7 +164,7 @@ class Signer:
         """
         times = self.times
         newest = times.newest + 1
-        clock = self._zero + time.monotonic_ns() // NS_PER_UNIT
+        clock = (self._zero_ns + time.monotonic_ns()) // NS_PER_UNIT
         newest = newest if newest > clock else clock
         times.newest = newest = newest if newest < TIME_END else TIME_END - 1
         tail = self._link + newest.to_bytes(_TIME_BYTES, "little")

@@ -68,7 +68,7 @@ class KeptSigner(Signer):
     def keep(self) -> None:
         """Writes the times, and those ahead that count as used, to the disk; from any thread."""
         now = self.now()
-        used = max(self._used(), self._zero + time.monotonic_ns() // NS_PER_UNIT)
+        used = max(self._used(), (self._zero_ns + time.monotonic_ns()) // NS_PER_UNIT)
         reserved = max(used + _RESERVE, now + _SIGNED)
         try:
             with self._storing:

@@ -19,6 +19,7 @@ from flight_cases import (
 )
 
 from companion.config import find
+from companion.flight import accounting
 from companion.flight.guards import Guard
 from companion.flight.loop import FlightLoop
 from companion.flight.phases import Cause, Engagement
@@ -330,8 +331,9 @@ def test_a_vehicle_that_is_disarmed_in_the_air_gets_no_setpoint_any_more(tmp_pat
     assert stand.setpoints(AT_S + 1.1) == []  # HEARTBEAT comes once per second
 
 
-def test_the_delay_is_measured_and_used(tmp_path) -> None:
+def test_the_delay_is_measured_and_used(tmp_path, monkeypatch) -> None:
     """What was followed is told on the way in pieces, each new delay once, and whole at the end."""
+    monkeypatch.setattr(accounting, "PROGRESS_NS", 10_000_000)  # of real time, and a flight in lockstep has little
     pieces: list[list[tuple[float, float]]] = []
     engagements: list[Engagement] = []
 

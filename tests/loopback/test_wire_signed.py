@@ -51,7 +51,7 @@ class Voice:
         self.wire, self.system = wire, system
         self.signer = None if key is None else Signer(key, SigningTimes(time_now() if at is None else at, {}))
         if at is not None and self.signer is not None:
-            self.signer._zero = -(10**18)  # no clock, as PX4
+            self.signer._zero_ns = -(10**18)  # no clock, as PX4
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self.socket.settimeout(0.3)
