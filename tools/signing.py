@@ -119,7 +119,7 @@ class Forger:
         at = time_now() - NEW_STREAM_LATE - self._chance.randrange(100_000, 10**10)
         late = Signer(self._key, SigningTimes(0, {}, link_id=self._chance.randrange(201, 256)))
         late.now = lambda: at  # type: ignore[method-assign]
-        late._zero = -(10**15)
+        late._zero_ns = -(10**19)
         late.times.newest = at
         return self.made(late)
 
