@@ -16,7 +16,6 @@ import contextlib
 import json
 import math
 import os
-import socket
 import statistics
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from companion.errors import CompanionError
+from companion.flight.bundled import free_udp_port
 from companion.ground.client import Client
 from companion.ground.exchange import OWN_COMPONENT, OWN_SYSTEM
 from companion.ground.upload import Files
@@ -46,15 +46,6 @@ angular_rate_rad_s = 1.0
 PATIENCE_S = 60.0
 REACH = 1.20
 PARAM_REQUEST_LIST = 21
-
-
-def free_ports(count: int) -> list[int]:
-    """UDP ports that nobody has now."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
-        for sock in sockets:
-            sock.bind(("127.0.0.1", 0))
-        return [int(sock.getsockname()[1]) for sock in sockets]
 
 
 @contextlib.contextmanager
@@ -85,7 +76,7 @@ def vehicle(port: int, engine: str) -> contextlib.AbstractContextManager[subproc
 
 def by_fly(folder: Path, circle: Path, engine: str) -> FlightRecord:
     """A flight with nobody to serve."""
-    (port,) = free_ports(1)
+    port = free_udp_port()
     with vehicle(port, engine):
         command = [sys.executable, "-m", "companion", "fly", str(circle), "--vehicle", "bundled", "--engine", engine]
         command += ["--connect", f"udpin:127.0.0.1:{port}", "--out", str(folder), "--json"]
@@ -97,7 +88,7 @@ def by_fly(folder: Path, circle: Path, engine: str) -> FlightRecord:
 
 def by_serve(folder: Path, circle: Path, engine: str, *, busy: bool) -> FlightRecord:
     """The same by `companion serve`, with or without traffic."""
-    port, ground = free_ports(2)
+    port, ground = free_udp_port(), free_udp_port()
     stored, flights = folder / "stored", folder / "flights"
     stored.mkdir(parents=True)
     (stored / "circle.toml").write_text(circle.read_text())

@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
+from companion.flight.bundled import free_udp_port
 from companion.ground.links import GroundPort
 from companion.ground.standby import Standby
 from companion.link import codec
@@ -149,16 +150,9 @@ def run(forger: Forger, good: Callable[[], bytes], give: Callable[[bytes, bool],
     return Tally(tried, used, sent, accepted)
 
 
-def free_port() -> int:
-    """A UDP port that nobody has."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def vehicle_link(key_file: str, key: SigningKey, messages: int, chance: random.Random) -> Tally:
     """Heartbeats that say the vehicle is armed, from its own address; good ones say that it is not."""
-    port = free_port()
+    port = free_udp_port()
     sender = Signer(key, SigningTimes(time_now(), {}))
     with (
         Wire.open(f"udpin:127.0.0.1:{port}", key=key_file) as wire,
@@ -187,7 +181,7 @@ def vehicle_link(key_file: str, key: SigningKey, messages: int, chance: random.R
 
 def ground_link(key_file: str, key: SigningKey, messages: int, chance: random.Random) -> Tally:
     """Commands to start a trajectory."""
-    port = free_port()
+    port = free_udp_port()
     sender = Signer(key, SigningTimes(time_now(), {}))
     guard = open_signer(key_file)
     assert guard is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import random
 import socket
 import subprocess
 import sys
@@ -21,13 +22,22 @@ VEHICLE_FILE = "vehicle.toml"
 FAULTS_FILE = "faults.toml"
 PX4_VERSIONS = ("1.13", "1.18")
 """Which PX4 the vehicle can behave like."""
+_PORTS = range(20_000, 32_000)
+"""Below those that systems give to whoever asks for any: of those another program may get the same one right after."""
 
 
 def free_udp_port() -> int:
-    """A UDP port of the loopback interface that nobody has just now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A UDP port of the loopback interface that nobody has just now.
+
+    Raises:
+        LinkError: there is none.
+    """
+    chance = random.SystemRandom()  # programs that begin together must not try the same ones
+    for port in chance.sample(_PORTS, 100):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise LinkError(f"no UDP port between {_PORTS.start} and {_PORTS.stop} is free: stop programs that hold them")
 
 
 def start_of(flight: Flight) -> Start:

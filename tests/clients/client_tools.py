@@ -5,17 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from typing import Any
 
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
+from companion.flight.bundled import free_udp_port
 
 
 @contextlib.contextmanager
@@ -23,7 +18,7 @@ def vehicle(*options: str, speed: float = 5.0) -> Iterator[dict[str, Any]]:
     """Run a vehicle that first speaks to a free port; gives what it says about itself once it is ready."""
     command = [sys.executable, "-m", "sim_link", "run", "--vehicle", "paper", "--engine", "python"]
     command += ["--state-rate", "50", "--port", "0", "--remote-port", "0", "--no-truth-stream", "--json-ready"]
-    command += ["--ground-remote-port", str(free_port()), "--speed", str(speed), *options]
+    command += ["--ground-remote-port", str(free_udp_port()), "--speed", str(speed), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         yield json.loads(process.stdout.readline())

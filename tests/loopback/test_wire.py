@@ -14,6 +14,7 @@ from typing import ClassVar
 import pytest
 
 from companion.errors import InputError, LinkError
+from companion.flight.bundled import free_udp_port
 from companion.ground.links import GroundPort
 from companion.link import codec
 from companion.link.framing import Frame, FrameParser, LinkCounters, build_frame
@@ -44,15 +45,10 @@ def udp_socket() -> socket.socket:
     return sock
 
 
-def free_port() -> int:
-    with udp_socket() as sock:
-        return int(sock.getsockname()[1])
-
-
 @contextlib.contextmanager
 def listening(**options):
     """A wire that waits, and where to send to."""
-    port = free_port()
+    port = free_udp_port()
     with Wire.open(f"udpin:127.0.0.1:{port}", **options) as wire:
         yield wire, ("127.0.0.1", port)
 
@@ -211,7 +207,7 @@ def test_udpout_speaks_first_and_hears_the_answer():
 
 def test_udpout_survives_that_nobody_listens():
     # An address of its own: on the usual one somebody else's vehicle may be given the port meanwhile, and answers.
-    host, port = "127.0.0.9", free_port()
+    host, port = "127.0.0.9", free_udp_port()
     with Wire.open(f"udpout:{host}:{port}") as wire:
         for _ in range(5):
             wire.send(0, codec.encode_heartbeat())
@@ -421,11 +417,11 @@ def test_a_port_in_use_says_who_has_it():
 
 
 def test_a_port_that_is_unused_has_no_holder():
-    assert port_holder(free_port()) is None
+    assert port_holder(free_udp_port()) is None
 
 
 def test_a_closed_port_can_be_had_again():
-    port = free_port()
+    port = free_udp_port()
     for _ in range(3):
         Wire.open(f"udpin:127.0.0.1:{port}").close()
     transport = UdpTransport("127.0.0.1", port, listen=True)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from companion.flight.bundled import free_udp_port
 from companion.link import codec
 from companion.link.framing import build_frame
 from companion.link.key_file import new_key
@@ -34,9 +35,7 @@ def taped() -> list[tuple[int, bytes]]:
 
 @pytest.fixture
 def wire(tmp_path, key, taped) -> Iterator[Wire]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_udp_port()
     with Wire.open(
         f"udpin:127.0.0.1:{port}", key=str(tmp_path / "key"), tap=lambda way, raw, _: taped.append((way, raw))
     ) as wire:

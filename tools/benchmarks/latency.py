@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from companion.flight.bundled import free_udp_port
 from companion.link import codec
 from companion.link.framing import build_frame
 
@@ -25,7 +26,6 @@ from .common import (
     Setting,
     compiled,
     ended,
-    free_port,
     median,
     module_environment,
     p50_p99,
@@ -82,7 +82,7 @@ def states_wanted() -> str:
 def turn(kind: str, seconds: float, setting: Setting, options: tuple[str, ...] = ()) -> Turn:
     """One turn of one of them."""
     program = compiled(TOOLS / "echo.c", setting.folder)
-    here, port = free_port(), free_port()
+    here, port = free_udp_port(), free_udp_port()
     command = [PYTHON, "-m", "sim_link", "run", "--vehicle", "bundled", "--start", "0,0,-20", "--port", "0"]
     command += ["--remote-port", str(here), "--no-ground", "--no-truth-stream", "--json-ready", "--with-parent"]
     with running(command, stdout=subprocess.PIPE) as vehicle:
