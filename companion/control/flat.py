@@ -1,7 +1,7 @@
 """One whole control step, prediction included, on flat arrays: what the compiled engine calls.
 
 Nested tuples are expensive to hand to compiled code (some 30 us for a step), a few arrays of floats are not. The
-function is a kernel like the others and calls the very same `model.through` and `law.step`; with lists instead of
+function is a kernel like the others and calls the very same `model.through` and `law.step_plain`; with lists instead of
 arrays it runs as plain Python.
 """
 
@@ -11,18 +11,16 @@ from collections.abc import MutableSequence, Sequence
 
 from companion.control.heading import HeadingState
 from companion.control.law import (
-    Command,
     ControllerState,
-    Evaluation,
-    Gains,
-    Limits,
-    Model,
     Parameters,
-    lyapunov,
-    step,
+    PlainCommand,
+    PlainController,
+    PlainEvaluation,
+    lyapunov_plain,
+    step_plain,
 )
 from companion.control.model import Factors, through
-from companion.control.types import Reference, State
+from companion.control.types import PlainState
 
 # where things stand in the input, behind the state's 13 numbers
 DT = 13
@@ -95,63 +93,51 @@ def control_step(x: MutableSequence[float], c: Sequence[float], y: MutableSequen
         c: `constants`.
         y: gets RESULTS numbers, see the names above.
     """
-    state = State((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8], x[9]), (x[10], x[11], x[12]))
-    ref = Reference(
-        (x[18], x[19], x[20]),
-        (x[21], x[22], x[23]),
-        (x[24], x[25], x[26]),
-        (x[27], x[28], x[29]),
-        (x[30], x[31], x[32]),
-        x[33],
-        x[34],
-        x[35],
-    )
+    state = (x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8], x[9]), (x[10], x[11], x[12])
+    p, v, a = (x[18], x[19], x[20]), (x[21], x[22], x[23]), (x[24], x[25], x[26])
+    j, s = (x[27], x[28], x[29]), (x[30], x[31], x[32])
+    ref = p, v, a, j, s, x[33], x[34], x[35]
     b_hat = (x[38], x[39], x[40])
-    memory = HeadingState((x[41], x[42], x[43]), (x[44], x[45], x[46]), x[47] > 0.5)
-    controller = ControllerState(x[36], x[37], b_hat, memory, (x[48], x[49], x[50]))
-    gains = Gains(c[0], c[1], c[2], c[3], c[4], c[5], int(c[6]), c[7], c[8], c[9])
-    model = Model(c[10], c[11], c[12], (c[13], c[14], c[15]), (c[16], c[17], c[18]), c[19])
-    limits = Limits(c[20], c[21], (c[22], c[23], c[24]), c[25], c[26], c[27])
+    memory = (x[41], x[42], x[43]), (x[44], x[45], x[46]), x[47] > 0.5
+    controller = x[36], x[37], b_hat, memory, (x[48], x[49], x[50])
+    gains = c[0], c[1], c[2], c[3], c[4], c[5], int(c[6]), c[7], c[8], c[9]
+    model = c[10], c[11], c[12], (c[13], c[14], c[15]), (c[16], c[17], c[18]), c[19]
+    limits = c[20], c[21], (c[22], c[23], c[24]), c[25], c[26], c[27]
     lags = (c[28], c[29], c[30], c[31], c[32], c[33], c[34], c[35])
     state, _ = through(state, x[THRUST_NOW], x, PIECES, int(x[COUNT]), b_hat, (c[10], c[11], c[12]), lags)
-    command, after, out = step(state, ref, controller, Parameters(gains, model, limits), x[FROZEN] > 0.5, x[DT])
+    command, after, out = step_plain(state, ref, controller, (gains, model, limits), x[FROZEN] > 0.5, x[DT])
     if x[INTEGRATE] < 0.5:
         after = controller
-    e = out.errors
-    y[HEADING_ERROR] = out.heading_error
-    y[LYAPUNOV] = lyapunov(e, gains.p_max)
-    y[TOTAL] = after.thrust
-    y[TOTAL_RATE] = after.thrust_rate
-    y[LIMITS] = float(command.limits)
-    y[THRUST] = command.thrust
-    y[26], y[27], y[28], y[29] = state.q
-    x[36] = after.thrust
-    x[37] = after.thrust_rate
-    x[47] = 1.0 if after.heading.held else 0.0
+    thrust, rates, rates_model, tau, flags = command
+    x[36], x[37], b_hat, (r2d, forward, held), lead_integral = after
+    x[47] = 1.0 if held else 0.0
+    e, _, _, _, _, y[HEADING_ERROR] = out
+    y[LYAPUNOV] = lyapunov_plain(e, c[5])
+    y[TOTAL], y[TOTAL_RATE], y[LIMITS], y[THRUST] = x[36], x[37], float(flags), thrust
+    _, _, (y[26], y[27], y[28], y[29]), w = state
+    for i in range(12):
+        y[1 + i] = e[i]
     for i in range(3):
-        y[1 + i] = e.e1[i]
-        y[4 + i] = e.e2[i]
-        y[7 + i] = e.e3[i]
-        y[10 + i] = e.e4[i]
-        y[14 + i] = after.b_hat[i]
-        y[19 + i] = command.tau[i]
-        y[22 + i] = command.rates[i]
-        y[30 + i] = state.w[i]
-        y[34 + i] = command.rates_model[i]
-        x[38 + i] = after.b_hat[i]
-        x[41 + i] = after.heading.r2d[i]
-        x[44 + i] = after.heading.forward[i]
-        x[48 + i] = after.lead_integral[i]
+        y[14 + i] = b_hat[i]
+        y[19 + i] = tau[i]
+        y[22 + i] = rates[i]
+        y[30 + i] = w[i]
+        y[34 + i] = rates_model[i]
+        x[38 + i] = b_hat[i]
+        x[41 + i] = r2d[i]
+        x[44 + i] = forward[i]
+        x[48 + i] = lead_integral[i]
 
 
 def results(
-    command: Command, after: ControllerState, out: Evaluation, p_max: float, predicted: State
+    command: PlainCommand, after: PlainController, out: PlainEvaluation, p_max: float, predicted: PlainState
 ) -> tuple[float, ...]:
-    """The RESULTS numbers of a step that was computed with nested tuples."""
-    e = out.errors
+    """The RESULTS numbers of a step that was computed with tuples."""
+    thrust, rates, rates_model, tau, flags = command
+    total, total_rate, b_hat, _, _ = after
+    e, _, _, _, _, heading_error = out
+    _, _, q, w = predicted
     return (
-        *(out.heading_error, *e.e1, *e.e2, *e.e3, *e.e4, lyapunov(e, p_max)),
-        *(*after.b_hat, after.thrust, after.thrust_rate, *command.tau, *command.rates),
-        *(float(command.limits), *predicted.q, *predicted.w),
-        *(command.thrust, *command.rates_model),
+        *(heading_error, *e[:12], lyapunov_plain(e, p_max), *b_hat, total, total_rate, *tau, *rates),
+        *(float(flags), *q, *w, thrust, *rates_model),
     )

@@ -11,17 +11,17 @@ an array for compiled code. All functions are kernels.
 
 from __future__ import annotations
 
-import math
 from collections.abc import MutableSequence, Sequence
+from math import cos, exp, inf, isnan, nan
 from typing import NamedTuple
 
-from companion.control.model import PIECE, lag_factors, lagged
+from companion.control.model import PIECE, lag_factors
 from companion.control.types import Quat, State, Vec3
 from companion.control.vectors import quat_exp, quat_multiply, quat_normalise
 
 SHORTEST_S = 1e-6
 """Shorter pieces are rounding errors of the stamps."""
-APART_COSINE = math.cos(0.05)
+APART_COSINE = cos(0.05)
 """Of half the angle: attitudes further apart than 0.1 rad are of different estimates, with a reset between them."""
 
 # where things stand in a history
@@ -40,13 +40,16 @@ BEGIN = 5
 END = 6
 """Where the next one will."""
 COMMANDS = 7
-"""Where commands begin: the time from which it acts [s], thrust setpoint [N], rate setpoints [rad/s]."""
-COMMAND = 5
+"""Where commands begin: the time from which it acts [s], thrust setpoint [N], rate setpoints [rad/s], and what the ones
+before it have given until then, summed over time [N s, rad]. The first one has acted before its time, too. Behind the
+last one there is room for one more, whose time and sums may be known already."""
+COMMAND = 9
 CAPACITY = COMMANDS + 2048 * COMMAND
 """More than the longest delay that a vehicle file may have at 1000 states per second; where more would be under way the
 oldest is forgotten."""
-FORGOTTEN_MAX = 32 * COMMAND
-"""So much room at the front is used again: what is in use stays within a few kilobytes."""
+FORGOTTEN_MAX = 14 * COMMAND
+"""So much room at the front is used again: the sums stay small, and so do the indices of what is in use (plain Python
+has those up to 256 at hand, and makes all others)."""
 
 
 class Attitude(NamedTuple):
@@ -62,50 +65,76 @@ class Attitude(NamedTuple):
 
 def begin(h: MutableSequence[float], thrust_n: float, thrust_lag_s: float) -> None:
     """Begins with a hover: until the first command acts, what holds it does."""
-    h[THRUST], h[AT], h[LAG] = thrust_n, math.nan, thrust_lag_s
-    h[BEGIN], h[END] = float(COMMANDS), float(COMMANDS)
-    remember(h, -math.inf, thrust_n, 0.0, 0.0, 0.0)
+    h[THRUST], h[AT], h[LAG] = thrust_n, nan, thrust_lag_s
+    h[BEGIN], h[END] = COMMANDS, COMMANDS + COMMAND
+    for i in range(COMMANDS, COMMANDS + COMMAND):
+        h[i] = 0.0
+    h[COMMANDS + 1] = thrust_n
+    h[COMMANDS + COMMAND] = nan
 
 
 def remember(h: MutableSequence[float], from_s: float, thrust_n: float, x: float, y: float, z: float) -> None:
     """Appends a command: the time from which it acts [s], thrust setpoint [N] and body rate setpoints [rad/s]."""
     start, end = int(h[BEGIN]), int(h[END])
-    if end + COMMAND > CAPACITY and start == COMMANDS:  # full
-        start += COMMAND
-    if end + COMMAND > CAPACITY or start - COMMANDS >= max(FORGOTTEN_MAX, end - start):
-        for i in range(end - start):  # to the front with what is left
-            h[COMMANDS + i] = h[start + i]
-        end = COMMANDS + end - start
-        h[BEGIN] = float(COMMANDS)
+    if end + 2 * COMMAND > CAPACITY or start - COMMANDS >= FORGOTTEN_MAX:
+        end = _make_room(h, start, end)
+    if not -SHORTEST_S < from_s - h[end] < SHORTEST_S:  # else `gather` has summed already
+        i = end - COMMAND
+        for_s = from_s - h[i]
+        h[end + 5] = h[i + 5] + for_s * h[i + 1]
+        h[end + 6] = h[i + 6] + for_s * h[i + 2]
+        h[end + 7] = h[i + 7] + for_s * h[i + 3]
+        h[end + 8] = h[i + 8] + for_s * h[i + 4]
     h[end] = from_s
     h[end + 1] = thrust_n
     h[end + 2] = x
     h[end + 3] = y
     h[end + 4] = z
-    h[END] = float(end + COMMAND)
+    h[END] = end = end + COMMAND
+    h[end] = nan
+
+
+def _make_room(h: MutableSequence[float], start: int, end: int) -> int:
+    """Moves what is left to the front, where the sums begin anew; gives where it ends there, or ends now."""
+    full = end + 2 * COMMAND > CAPACITY
+    if full and start == COMMANDS:
+        start += COMMAND
+    if not full and start - COMMANDS < end - start:
+        return end
+    thrust, x, y, z = h[start + 5], h[start + 6], h[start + 7], h[start + 8]
+    i = COMMANDS
+    for j in range(start, end, COMMAND):
+        h[i : i + 5] = h[j : j + 5]
+        h[i + 5], h[i + 6] = h[j + 5] - thrust, h[j + 6] - x
+        h[i + 7], h[i + 8] = h[j + 7] - y, h[j + 8] - z
+        i += COMMAND
+    h[BEGIN] = COMMANDS
+    h[i] = nan
+    return i
 
 
 def follow(h: MutableSequence[float], stamp_s: float) -> None:
     """Brings the modelled thrust to a stamp [s] and forgets commands that have ceased to act."""
-    last_s = h[AT]
+    at_s, lag_s, thrust = h[AT], h[LAG], h[THRUST]
     h[AT] = stamp_s
-    if math.isnan(last_s):
+    i, end = int(h[BEGIN]), int(h[END])
+    if isnan(at_s):
+        if end - i == COMMAND:  # nothing is summed yet
+            h[i] = stamp_s
         return
-    begin_at, end = int(h[BEGIN]), int(h[END])
-    at_s = max(last_s, h[begin_at])
-    thrust = h[THRUST]
     while True:
-        following = begin_at + COMMAND
-        following_s = h[following] if following < end else math.inf
+        following = i + COMMAND
+        following_s = h[following] if following < end else inf
         until_s = following_s if following_s < stamp_s else stamp_s
         if until_s - at_s > SHORTEST_S:
-            thrust = lagged(thrust, h[begin_at + 1], h[LAG], until_s - at_s)[0]
-            at_s = until_s
+            setpoint = h[i + 1]
+            gap = (thrust - setpoint) * exp((at_s - until_s) / lag_s) if lag_s > 0.0 else 0.0
+            thrust, at_s = setpoint + gap, until_s
         if following_s > stamp_s + SHORTEST_S:
             break
-        begin_at = following
+        i = following
     h[THRUST] = thrust
-    h[BEGIN] = float(begin_at)
+    h[BEGIN] = i
 
 
 def gather(h: MutableSequence[float], stamp_s: float, out: MutableSequence[float], at: int) -> int:
@@ -126,33 +155,26 @@ def gather(h: MutableSequence[float], stamp_s: float, out: MutableSequence[float
     length_s = h[LENGTH]
     k = 1.0 / length_s
     i, end = int(h[BEGIN]), int(h[END])
-    at_s, edge_s = stamp_s, stamp_s + length_s
-    thrust = x = y = z = 0.0
-    done = 0
-    while True:
-        t, p, q, r = h[i + 1], h[i + 2], h[i + 3], h[i + 4]
-        i += COMMAND
-        until_s = h[i] if i < end else math.inf
-        while until_s > edge_s - SHORTEST_S:  # the piece ends within this command
-            share_s = edge_s - at_s
-            out[at] = k * (thrust + share_s * t)
-            out[at + 1] = k * (x + share_s * p)
-            out[at + 2] = k * (y + share_s * q)
-            out[at + 3] = k * (z + share_s * r)
-            out[at + 4] = length_s
-            at += PIECE
-            done += 1
-            if done == count:
-                return count
-            thrust = x = y = z = 0.0
-            at_s, edge_s = edge_s, edge_s + length_s
-        if i >= end:  # not with finite times: what comes last acts for ever
-            return done
-        share_s = until_s - at_s
-        if share_s > 0.0:
-            thrust += share_s * t
-            x, y, z = x + share_s * p, y + share_s * q, z + share_s * r
-            at_s = until_s
+    last = end - COMMAND
+    for_s = stamp_s - h[i]
+    t0, x0, y0, z0 = h[i + 5], h[i + 6], h[i + 7], h[i + 8]
+    t0, x0, y0, z0 = t0 + for_s * h[i + 1], x0 + for_s * h[i + 2], y0 + for_s * h[i + 3], z0 + for_s * h[i + 4]
+    for _ in range(count):
+        stamp_s += length_s
+        while i < last and h[i + COMMAND] < stamp_s:
+            i += COMMAND
+        for_s = stamp_s - h[i]
+        t, x, y, z = h[i + 5], h[i + 6], h[i + 7], h[i + 8]
+        t, x, y, z = t + for_s * h[i + 1], x + for_s * h[i + 2], y + for_s * h[i + 3], z + for_s * h[i + 4]
+        out[at] = k * (t - t0)
+        out[at + 1] = k * (x - x0)
+        out[at + 2] = k * (y - y0)
+        out[at + 3] = k * (z - z0)
+        out[at + 4] = length_s
+        t0, x0, y0, z0 = t, x, y, z
+        at += PIECE
+    h[end], h[end + 5], h[end + 6], h[end + 7], h[end + 8] = stamp_s, t0, x0, y0, z0  # its own command begins there
+    return count
 
 
 def refreshed(

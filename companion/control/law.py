@@ -12,11 +12,11 @@ the same source.
 
 from __future__ import annotations
 
-import math
+from math import copysign, expm1, sqrt
 from typing import NamedTuple
 
-from companion.control.heading import DAMPING, HeadingState, heading_torque
-from companion.control.types import Quat, Reference, State, Vec3, new_record
+from companion.control.heading import DAMPING, HeadingState, PlainHeading, heading_torque
+from companion.control.types import PlainReference, PlainState, Quat, Reference, State, Vec3
 from companion.control.vectors import axes, cross, norm
 
 LIMIT_THRUST_MIN = 1
@@ -29,6 +29,7 @@ LIMIT_HEADING_HELD = 64
 
 PROJECTION_LAYER = 0.1
 """Share of the ball's radius over which the projection fades in: a hard one would step the torque."""
+INNER = 1.0 - PROJECTION_LAYER
 
 
 LEAD_FADE_1_S = 0.2
@@ -157,6 +158,20 @@ class Parameters(NamedTuple):
     limits: Limits
 
 
+PlainErrors = tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float, float, float, float
+]  # fmt: skip
+PlainEvaluation = tuple[PlainErrors, Vec3, float, Vec3, PlainHeading, float]
+PlainController = tuple[float, float, Vec3, PlainHeading, Vec3]
+PlainCommand = tuple[float, Vec3, Vec3, Vec3, int]
+PlainParameters = tuple[
+    tuple[float, float, float, float, float, float, int, float, float, float],
+    tuple[float, float, float, Vec3, Vec3, float],
+    tuple[float, float, Vec3, float, float, float],
+]
+"""What the records hold (see `types.PlainState`)."""
+
+
 def projected(free: Vec3, b_hat: Vec3, bound: float) -> Vec3:
     """b_hat' (33), projected so that |b_hat| stays within `bound`.
 
@@ -170,7 +185,7 @@ def projected(free: Vec3, b_hat: Vec3, bound: float) -> Vec3:
     """
     b0, b1, b2 = b_hat
     size_sq = b0 * b0 + b1 * b1 + b2 * b2
-    inner = (1.0 - PROJECTION_LAYER) * bound
+    inner = INNER * bound
     if size_sq <= inner * inner:
         return free
     x, y, z = free
@@ -185,6 +200,25 @@ def projected(free: Vec3, b_hat: Vec3, bound: float) -> Vec3:
 def evaluate(
     state: State, ref: Reference, controller: ControllerState, parameters: Parameters, frozen: bool, dt_s: float
 ) -> Evaluation:
+    """The law at one instant (see `evaluate_plain`)."""
+    return evaluation_of(evaluate_plain(state, ref, controller, parameters, frozen, dt_s))
+
+
+def evaluation_of(out: PlainEvaluation) -> Evaluation:
+    """The record of what `evaluate_plain` gives."""
+    e, b_hat_rate, thrust_acceleration, tau, heading, heading_error = out
+    errors = Errors((e[0], e[1], e[2]), (e[3], e[4], e[5]), (e[6], e[7], e[8]), (e[9], e[10], e[11]), e[12:])
+    return Evaluation(errors, b_hat_rate, thrust_acceleration, tau, HeadingState(*heading), heading_error)
+
+
+def evaluate_plain(
+    state: PlainState,
+    ref: PlainReference,
+    controller: PlainController,
+    parameters: PlainParameters,
+    frozen: bool,
+    dt_s: float,
+) -> PlainEvaluation:
     """The law at one instant: errors, derivatives of the controller's state, angular acceleration.
 
     Written out per axis in one piece: every tuple and call on the way costs plain Python more than what is done in it.
@@ -200,9 +234,12 @@ def evaluate(
         dt_s: sample interval for the heading's rate limit [s]; 0 for the continuous form, which has none.
     """
     (k1, k2, k3, k4, gamma, p_max, heading_kind, l1, l2, damping), (mass, gravity, d, _, _, _), limits = parameters
+    thrust_min, _, _, disturbance_max, turn_max, slow = limits
     thrust, thrust_rate, b_hat, memory, _ = controller
-    (p0, p1, p2), (v0, v1, v2), q, (w1, w2, w3) = state
-    (pd0, pd1, pd2), (vd0, vd1, vd2), (ad0, ad1, ad2), (jd0, jd1, jd2), (sd0, sd1, sd2), _, _, _ = ref
+    (p0, p1, p2), (v0, v1, v2), q, w = state
+    w1, w2, w3 = w
+    (pd0, pd1, pd2), vd, ad, jd, (sd0, sd1, sd2), yaw, yaw_rate, yaw_acceleration = ref
+    (vd0, vd1, vd2), (ad0, ad1, ad2), (jd0, jd1, jd2) = vd, ad, jd
     b0, b1, b2 = b_hat
     body = axes(q)
     (r10, r11, r12), (r20, r21, r22), (r30, r31, r32) = body
@@ -219,17 +256,17 @@ def evaluate(
 
     # e1 (8), sigma(e1) (26), e1' and e2 (25)
     e10, e11, e12 = p0 - pd0, p1 - pd1, p2 - pd2
-    x, y, z = e10, e11, e12
-    size_sq = x * x + y * y + z * z
+    s10, s11, s12 = e10, e11, e12
+    size_sq = e10 * e10 + e11 * e11 + e12 * e12
     outside = size_sq > p_max * p_max
     if outside:
-        bound = p_max / math.sqrt(size_sq)
-        x, y, z = bound * x, bound * y, bound * z
-    sigma = (x, y, z)
+        bound = p_max / sqrt(size_sq)
+        s10, s11, s12 = bound * e10, bound * e11, bound * e12
     x1, y1, z1 = v0 - vd0, v1 - vd1, v2 - vd2
-    e20, e21, e22 = x + per_k1 * x1, y + per_k1 * y1, z + per_k1 * z1
+    e20, e21, e22 = s10 + per_k1 * x1, s11 + per_k1 * y1, s12 + per_k1 * z1
     # e3 (30): a = F/m - (T/m) r3
-    e30, e31, e32 = e20 + c0 * (f0 - t_m * r30), e21 + c0 * (f1 - t_m * r31), e22 + c0 * (f2 - t_m * r32)
+    a0, a1, a2 = f0 - t_m * r30, f1 - t_m * r31, f2 - t_m * r32
+    e30, e31, e32 = e20 + c0 * a0, e21 + c0 * a1, e22 + c0 * a2
     # e4 (15): j = -(T'/m) r3 - (T/m) R S(w) u3 - q3, with R S(w) u3 = w2 r1 - w1 r2
     x, y = t_m * w1, t_m * w2
     e40 = e30 + c1 * (x * r20 - y * r10 - td_m * r30 - j0)
@@ -243,7 +280,9 @@ def evaluate(
     x2 = y2 = z2 = 0.0
     if not frozen and gamma > 0.0:
         free = (gamma * (e20 + e30 + e40), gamma * (e21 + e31 + e41), gamma * (e22 + e32 + e42))
-        b_hat_rate = projected(free, b_hat, limits.disturbance_max)
+        b_hat_rate, inner = free, INNER * disturbance_max
+        if b0 * b0 + b1 * b1 + b2 * b2 > inner * inner:
+            b_hat_rate = projected(free, b_hat, disturbance_max)
         b0_rate, b1_rate, b2_rate = b_hat_rate
         if heading_kind != DAMPING and b_hat_rate == free:
             of_rate, of_e2, of_e3, of_e4 = 3.0 - 3.0 * d * per_k1, -2.0 * kk, -2.0 * k3, ks - k4
@@ -256,11 +295,11 @@ def evaluate(
                 x2, y2, z2 = x2 + less * x1 - radial * e10, y2 + less * y1 - radial * e11, z2 + less * z1 - radial * e12
             x2, y2, z2 = gamma * x2, gamma * y2, gamma * z2
 
-    # h (19) without its gyroscopic term, plus c0 b_hat' (34)
+    # h (19) without its gyroscopic term, plus c0 b_hat' (34); k1 k2 (e3 - e2) is a/k1
     k_sum = ks + k4
-    h0 = kk * (e30 - e20) + k_sum * e40 - c1 * s0 + c0 * b0_rate
-    h1 = kk * (e31 - e21) + k_sum * e41 - c1 * s1 + c0 * b1_rate
-    h2 = kk * (e32 - e22) + k_sum * e42 - c1 * s2 + c0 * b2_rate
+    h0 = per_k1 * a0 + k_sum * e40 - c1 * s0 + c0 * b0_rate
+    h1 = per_k1 * a1 + k_sum * e41 - c1 * s1 + c0 * b1_rate
+    h2 = per_k1 * a2 + k_sum * e42 - c1 * s2 + c0 * b2_rate
     # y (34): S(w) (S(w) T u3 + 2 T' u3) of (19), in body coordinates, where S(w) u3 = (w2, -w1, 0), is added to R'h;
     # its factor c1/m cancels. T'', tau1 and tau2 by (20)
     m_c1 = mass / c1
@@ -270,28 +309,46 @@ def evaluate(
         x * w2 - y * w1 - m_c1 * (r20 * h0 + r21 * h1 + r22 * h2),
         thrust * (w1 * w1 + w2 * w2) + m_c1 * (r30 * h0 + r31 * h1 + r32 * h2),
     )
-    divisor = max(thrust, limits.thrust_min)
+    divisor = thrust if thrust > thrust_min else thrust_min
 
     # F/m with its derivatives: the direction that the thrust will have with no error
+    wanted = yaw, yaw_rate, yaw_acceleration
     force = (f0, f1, f2), (b0_rate - j0, b1_rate - j1, b2_rate - j2), (x2 - s0, y2 - s1, z2 - s2)
-    turn_max, slow = limits.heading_rate_max, limits.heading_speed_min
     tau3, heading, heading_error = heading_torque(
-        state, ref, force, memory, heading_kind, (l1, l2, damping), (turn_max, slow), dt_s, body
+        w, (vd, ad, jd), wanted, force, memory, heading_kind, l1, l2, damping, turn_max, slow, dt_s, body
     )
-    e = new_record(Errors, ((e10, e11, e12), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), sigma))
-    tau = (y / divisor, -x / divisor, tau3)
-    return new_record(Evaluation, (e, b_hat_rate, thrust_acceleration, tau, heading, heading_error))
+    e = (e10, e11, e12, e20, e21, e22, e30, e31, e32, e40, e41, e42, s10, s11, s12)
+    return e, b_hat_rate, thrust_acceleration, (y / divisor, -x / divisor, tau3), heading, heading_error
 
 
 def lead_time(lag_s: float, dt_s: float) -> float:
     """How far ahead a setpoint has to be [s]: w + tau lead, held over dt, takes a first-order rate loop from w to
     w + tau dt (docs/law.md section 8)."""
-    return dt_s if lag_s <= 0.0 else -dt_s / math.expm1(-dt_s / lag_s)
+    return dt_s if lag_s <= 0.0 else -dt_s / expm1(-dt_s / lag_s)
 
 
 def step(
     state: State, ref: Reference, controller: ControllerState, parameters: Parameters, frozen: bool, dt_s: float
 ) -> tuple[Command, ControllerState, Evaluation]:
+    """One sampled control step (see `step_plain`)."""
+    command, after, out = step_plain(state, ref, controller, parameters, frozen, dt_s)
+    return Command(*command), controller_of(after), evaluation_of(out)
+
+
+def controller_of(after: PlainController) -> ControllerState:
+    """The record of a controller's state."""
+    thrust, thrust_rate, b_hat, heading, lead_integral = after
+    return ControllerState(thrust, thrust_rate, b_hat, HeadingState(*heading), lead_integral)
+
+
+def step_plain(
+    state: PlainState,
+    ref: PlainReference,
+    controller: PlainController,
+    parameters: PlainParameters,
+    frozen: bool,
+    dt_s: float,
+) -> tuple[PlainCommand, PlainController, PlainEvaluation]:
     """One sampled control step: evaluate the law, integrate its state over dt, and limit.
 
     T += T' dt + T'' dt^2/2, T' += T'' dt, b_hat += b_hat' dt (explicit Euler on T diverges when sampled slowly).
@@ -313,12 +370,13 @@ def step(
     thrust_min, thrust_max, (most_x, most_y, most_z), bound, _, _ = limits
     thrust_now, thrust_rate_now, (b0, b1, b2), _, (lead_x, lead_y, lead_z) = controller
     hold = frozen or thrust_now <= thrust_min or thrust_now >= thrust_max
-    out = evaluate(state, ref, controller, parameters, hold, dt_s)
+    out = evaluate_plain(state, ref, controller, parameters, hold, dt_s)
     _, (b0_rate, b1_rate, b2_rate), thrust_acceleration, tau, heading, _ = out
+    _, _, held = heading
     flags = 0
     if hold:
         flags |= LIMIT_ESTIMATOR_FROZEN
-    if heading.held:
+    if held:
         flags |= LIMIT_HEADING_HELD
 
     thrust = thrust_now + dt_s * (thrust_rate_now + 0.5 * dt_s * thrust_acceleration)
@@ -333,10 +391,11 @@ def step(
         flags |= LIMIT_THRUST_MAX
     b0, b1, b2 = b0 + dt_s * b0_rate, b1 + dt_s * b1_rate, b2 + dt_s * b2_rate
     size_sq = b0 * b0 + b1 * b1 + b2 * b2
-    if size_sq > (1.0 - PROJECTION_LAYER) ** 2 * bound * bound:
+    inner = INNER * bound
+    if size_sq > inner * inner:
         flags |= LIMIT_DISTURBANCE
         if size_sq > bound * bound:  # the last of the discretisation: the smooth projection has done the rest
-            shrink = bound / math.sqrt(size_sq)
+            shrink = bound / sqrt(size_sq)
             b0, b1, b2 = shrink * b0, shrink * b1, shrink * b2
     _, _, _, (wx, wy, wz) = state
     x, y, z = tau
@@ -348,22 +407,22 @@ def step(
         x, y = x / over, y / over
         flags |= LIMIT_ROLL_PITCH_RATE
     if abs(z) > most_z:
-        z = math.copysign(most_z, z)
+        z = copysign(most_z, z)
         flags |= LIMIT_YAW_RATE
     rx, ry, rz = x - kx * lead_x, y - ky * lead_y, z - kz * lead_z
-    if abs(rx) > most_x:
-        rx = math.copysign(most_x, rx)
-    if abs(ry) > most_y:
-        ry = math.copysign(most_y, ry)
-    if abs(rz) > most_z:
-        rz = math.copysign(most_z, rz)
     # The autopilot integrates every lead w_cmd - w. All of it must not be taken back out: what a constant torque
     # disturbance leaves is the integral's own business, so the memory fades.
     lead = (
-        lead_x + dt_s * (x - wx - (kx + LEAD_FADE_1_S) * lead_x),
-        lead_y + dt_s * (y - wy - (ky + LEAD_FADE_1_S) * lead_y),
-        lead_z + dt_s * (z - wz - (kz + LEAD_FADE_1_S) * lead_z),
+        lead_x + dt_s * (rx - wx - LEAD_FADE_1_S * lead_x),
+        lead_y + dt_s * (ry - wy - LEAD_FADE_1_S * lead_y),
+        lead_z + dt_s * (rz - wz - LEAD_FADE_1_S * lead_z),
     )
+    if abs(rx) > most_x:
+        rx = copysign(most_x, rx)
+    if abs(ry) > most_y:
+        ry = copysign(most_y, ry)
+    if abs(rz) > most_z:
+        rz = copysign(most_z, rz)
     # the same inversion for the rotors' lag: the setpoint that brings the thrust to T at the end of the interval
     ahead = thrust_now + (thrust - thrust_now) / dt_s * lead_time(thrust_lag, dt_s)
     if ahead > thrust_max:
@@ -372,8 +431,7 @@ def step(
     elif ahead < thrust_min:
         ahead = thrust_min
         flags |= LIMIT_THRUST_MIN
-    command = new_record(Command, (ahead, (rx, ry, rz), (x, y, z), tau, flags))
-    return command, new_record(ControllerState, (thrust, thrust_rate, (b0, b1, b2), heading, lead)), out
+    return (ahead, (rx, ry, rz), (x, y, z), tau, flags), (thrust, thrust_rate, (b0, b1, b2), heading, lead), out
 
 
 def start(thrust: float, q: Quat, mass: float, gravity: float, bound: float) -> tuple[float, Vec3]:
@@ -389,9 +447,14 @@ def start(thrust: float, q: Quat, mass: float, gravity: float, bound: float) -> 
 
 def lyapunov(e: Errors, p_max: float) -> float:
     """V_H of docs/law.md section 4 without its b_tilde term, which nobody can measure [m^2]."""
-    (x, y, z), (e20, e21, e22), (e30, e31, e32), (e40, e41, e42), _ = e
+    return lyapunov_plain((*e.e1, *e.e2, *e.e3, *e.e4, *e.sigma), p_max)
+
+
+def lyapunov_plain(e: PlainErrors, p_max: float) -> float:
+    """The same."""
+    x, y, z, e20, e21, e22, e30, e31, e32, e40, e41, e42, _, _, _ = e
     size_sq = x * x + y * y + z * z
-    potential = 0.5 * size_sq if size_sq <= p_max * p_max else p_max * math.sqrt(size_sq) - 0.5 * p_max * p_max
+    potential = 0.5 * size_sq if size_sq <= p_max * p_max else p_max * sqrt(size_sq) - 0.5 * p_max * p_max
     outer = e20 * e20 + e21 * e21 + e22 * e22 + e30 * e30 + e31 * e31 + e32 * e32
     return potential + 0.5 * (outer + e40 * e40 + e41 * e41 + e42 * e42)
 

@@ -8,11 +8,10 @@ and the certificate linearises the very same function.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from math import cos, exp, sin, sqrt
 
-from companion.control.types import State, Vec3, new_record
-from companion.control.vectors import quat_exp
+from companion.control.types import PlainState, State, Vec3
 
 PIECE = 5
 """Numbers of a piece: mean thrust setpoint [N], mean rate setpoints [rad/s], duration [s]."""
@@ -22,18 +21,11 @@ Lags = tuple[float, float, float, float]
 Factors = tuple[float, float, float, float, float, float, float, float]
 
 
-def lagged(x: float, setpoint: float, lag_s: float, dt_s: float) -> tuple[float, float]:
-    """A first-order lag after dt, and its mean over dt."""
-    decay, share = lag_factors(lag_s, dt_s)
-    gap = x - setpoint
-    return setpoint + gap * decay, setpoint + gap * share
-
-
 def lag_factors(lag_s: float, dt_s: float) -> tuple[float, float]:
     """What is left of a gap after dt, and on average over dt."""
     if lag_s <= 0.0:
         return 0.0, 0.0
-    decay = math.exp(-dt_s / lag_s)
+    decay = exp(-dt_s / lag_s)
     return decay, (1.0 - decay) * lag_s / dt_s
 
 
@@ -62,11 +54,13 @@ def advance(
 
     The rest is as for `through`.
     """
-    return through(state, thrust, (thrust_setpoint, rates[0], rates[1], rates[2], dt_s), 0, 1, b_hat, vehicle, lags)
+    piece = (thrust_setpoint, rates[0], rates[1], rates[2], dt_s)
+    (p, v, q, w), thrust = through(state, thrust, piece, 0, 1, b_hat, vehicle, lags)
+    return State(p, v, q, w), thrust
 
 
 def through(
-    state: State,
+    state: PlainState,
     thrust: float,
     pieces: Sequence[float],
     at: int,
@@ -74,7 +68,7 @@ def through(
     b_hat: Vec3,
     vehicle: tuple[float, float, float],
     lags: Factors,
-) -> tuple[State, float]:
+) -> tuple[PlainState, float]:
     """The vehicle after some pieces, one command each.
 
     Args:
@@ -94,15 +88,23 @@ def through(
     (px, py, pz), (vx, vy, vz), (a, b, c, d), (wx, wy, wz) = state
     x0, x1, y0, y1, z0, z1, t0, t1 = lags
     b0, b1, b2 = b_hat
-    half = 0.5 / mass
-    # the thrust's direction r3
-    north, east, down = 2.0 * (b * d + a * c), 2.0 * (c * d - a * b), 1.0 - 2.0 * (b * b + c * c)
+    per_mass = 1.0 / mass
+    # half of the thrust's direction r3: of two of them the mean is the sum
+    north, east, down = b * d + a * c, c * d - a * b, 0.5 - b * b - c * c
     for _ in range(count):
         setpoint, rx, ry, rz, dt_s = pieces[at], pieces[at + 1], pieces[at + 2], pieces[at + 3], pieces[at + 4]
         at += PIECE
         # body rates and thrust: where the lag brings them, and their means on the way
         x, y, z, gap = wx - rx, wy - ry, wz - rz, thrust - setpoint
-        r, i, j, k = quat_exp((dt_s * (rx + x * x1), dt_s * (ry + y * y1), dt_s * (rz + z * z1)))
+        i, j, k = rx + x * x1, ry + y * y1, rz + z * z1
+        s = 0.5 * dt_s
+        half_sq = s * s * (i * i + j * j + k * k)  # of the angle turned, as in `vectors.quat_exp`
+        if half_sq < 1e-12:
+            by, r = s * (1.0 - half_sq / 6.0), 1.0 - 0.5 * half_sq
+        else:
+            half = sqrt(half_sq)
+            by, r = s * sin(half) / half, cos(half)
+        i, j, k = by * i, by * j, by * k
         wx, wy, wz = rx + x * x0, ry + y * y0, rz + z * z0
         a, b, c, d = (
             a * r - b * i - c * j - d * k,
@@ -111,13 +113,13 @@ def through(
             a * k + b * j - c * i + d * r,
         )
         from_north, from_east, from_down = north, east, down
-        north, east, down = 2.0 * (b * d + a * c), 2.0 * (c * d - a * b), 1.0 - 2.0 * (b * b + c * c)
-        pull = half * (setpoint + gap * t1)
+        north, east, down = b * d + a * c, c * d - a * b, 0.5 - b * b - c * c
+        pull = per_mass * (setpoint + gap * t1)
         a0 = b0 - drag * vx - pull * (from_north + north)
         a1 = b1 - drag * vy - pull * (from_east + east)
         a2 = b2 - drag * vz - pull * (from_down + down) + gravity
-        s = 0.5 * dt_s
-        px, py, pz = px + dt_s * (vx + s * a0), py + dt_s * (vy + s * a1), pz + dt_s * (vz + s * a2)
+        from_x, from_y, from_z = vx, vy, vz
         vx, vy, vz = vx + dt_s * a0, vy + dt_s * a1, vz + dt_s * a2
+        px, py, pz = px + s * (from_x + vx), py + s * (from_y + vy), pz + s * (from_z + vz)
         thrust = setpoint + gap * t0
-    return new_record(State, ((px, py, pz), (vx, vy, vz), (a, b, c, d), (wx, wy, wz))), thrust
+    return ((px, py, pz), (vx, vy, vz), (a, b, c, d), (wx, wy, wz)), thrust

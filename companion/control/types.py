@@ -21,6 +21,13 @@ new_record: Final = tuple.__new__
 times as long."""
 
 
+PlainState = tuple[Vec3, Vec3, Quat, Vec3]
+"""What a State holds. Kernels on the way of a control step hand on plain tuples: plain Python makes and unpacks them
+several times as fast as it does a NamedTuple."""
+PlainReference = tuple[Vec3, Vec3, Vec3, Vec3, Vec3, float, float, float]
+"""What a Reference holds."""
+
+
 class State(NamedTuple):
     """What the vehicle is known to do at one instant."""
 

@@ -274,6 +274,7 @@ class Timed:
 
     def __init__(self, course: Course, begin_s: float) -> None:
         self.course, self.begin_s = course, begin_s
+        self._on_track = course.path.inside
         self._take(course.curves[0] if course.curves else None)
 
     def _take(self, curve: Curve | None) -> None:
@@ -283,7 +284,11 @@ class Timed:
 
     def __call__(self, t_s: float) -> Reference:
         """The reference at a vehicle time [s]."""
-        return self.course.at(t_s - self.begin_s)
+        course, t_s = self.course, t_s - self.begin_s
+        on_track_s = t_s - course.join_s
+        if 0.0 <= on_track_s <= course.track_s and t_s < course.changes_s and course.moved_m is ZERO:
+            return self._on_track(on_track_s)  # the usual case, without the calls on the way
+        return course.at(t_s)
 
     def goes_on(self, stamp_s: float, delay_s: float) -> bool:
         """Whether the curve of the last answer gives the reference at a stamp and a delay later [s], too."""

@@ -1,26 +1,36 @@
 """The arithmetic of the control steps: called as it is written, or compiled.
 
-Both engines call the very same `control.model.through` and `control.law.step`. The compiled one can make whole steps in
-one call (`flight.fused`), with the history of commands and the reference on a curve; a tracker whose steps are all
-alike asks for them with hardly more than the state.
+Both engines call the very same `control.model.through` and `control.law.step_plain`, and make whole steps: with the
+history of commands and the reference, which the compiled one works out in the same call (`flight.fused`) where it is on
+a curve. A tracker whose steps are all alike asks for the next one with hardly more than the state.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableSequence, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from companion import accelerate
 from companion.control import flat, history
-from companion.control.history import Attitude
-from companion.control.law import Command, ControllerState, Evaluation, Parameters, step
+from companion.control.history import THRUST, Attitude, follow, gather, remember
+from companion.control.law import (
+    ControllerState,
+    Parameters,
+    PlainCommand,
+    PlainController,
+    PlainEvaluation,
+    PlainParameters,
+    controller_of,
+    step_plain,
+)
 from companion.control.model import PIECE, Factors, through
-from companion.control.output import RateSetpoint
-from companion.control.types import Quat, Reference, State, Vec3, new_record
+from companion.control.output import RateSetpoint, thrust_fraction
+from companion.control.types import PlainState, Quat, Reference, State, Vec3, new_record
 from companion.flight import fused
 from companion.flight.course import Curve, Timed
+from companion.flight.prediction import PIECES_MAX
 
 Numbers = tuple[float, ...]
 ReferenceAt = Callable[[float], Reference]
@@ -29,14 +39,9 @@ _REFERENCE, _COURSE = 8 * (fused.INPUT + flat.REFERENCE), 8 * fused.ON_CURVE
 """Where things stand in the memory, in bytes."""
 
 
-class Stepped(NamedTuple):
-    """What one step of an engine gives to be sent and remembered."""
-
-    command: Command
-    q: Quat
-    """The attitude for which it was computed."""
-    w: Vec3
-    """The body rates for which it was computed [rad/s]."""
+Stepped = tuple[PlainCommand, Quat, Vec3]
+"""What one step of an engine gives to be sent and remembered: the command, and the attitude and the body rates [rad/s]
+for which it was computed."""
 
 
 class Engine(Protocol):
@@ -87,6 +92,65 @@ class Engine(Protocol):
         ...
 
 
+class WholeSteps(Engine, Protocol):
+    """An engine that makes whole steps: with the history of commands and the reference."""
+
+    @property
+    def refreshed(self) -> bool:
+        """Whether the last step predicted from an attitude newer than its state."""
+        ...
+
+    def convert(self, thrust_full_n: float, curve_factor: float) -> None:
+        """Turns thrust into commands so from now on (`output.Conversion`)."""
+        ...
+
+    def predict(
+        self, commands: MutableSequence[float], lags_s: Vec3, delay_s: float, interval_s: float, gap_max_s: float
+    ) -> None:
+        """How whole steps are made from now on.
+
+        Args:
+            commands: the history (`control.history`).
+            lags_s: of roll, pitch and yaw rate behind their setpoints [s].
+            delay_s: from a stamp to the effect of its command [s].
+            interval_s: in place of the time since the last step, where there is none to integrate over [s].
+            gap_max_s: the longest one to integrate over [s].
+        """
+        ...
+
+    def fly(
+        self,
+        stamp_s: float,
+        state: State,
+        last_s: float | None,
+        reference_at: ReferenceAt,
+        attitude: Attitude | None,
+        frozen: bool,
+    ) -> Stepped:
+        """A whole step.
+
+        Args:
+            stamp_s: vehicle time of the state [s].
+            state: as received.
+            last_s: stamp of the step before [s]; None: this is the first.
+            reference_at: the reference as a function of vehicle time [s].
+            attitude: newer than the state.
+            frozen: hold the estimator still.
+        """
+        ...
+
+    def again(self, stamp_s: float, state: State, timed: Timed) -> RateSetpoint | None:
+        """A whole step like the last one, which had the same reference, nothing newer than its state and no reason to
+        hold the estimator still; None, and nothing is changed, where it cannot be like it.
+
+        Args:
+            stamp_s: vehicle time of the state [s].
+            state: as received.
+            timed: the reference.
+        """
+        ...
+
+
 class Kernels(NamedTuple):
     """The engine of the control steps."""
 
@@ -105,34 +169,41 @@ def stepped(n: Numbers) -> Stepped:
     """What a step gave, from its numbers."""
     rates, model, tau = _vec3(n[flat.RATES]), _vec3(n[flat.RATES_MODEL]), _vec3(n[flat.TAU])
     a, b, c, d = n[flat.PREDICTED_Q]
-    command = Command(n[flat.THRUST], rates, model, tau, int(n[flat.LIMITS]))
-    return Stepped(command, (a, b, c, d), _vec3(n[flat.PREDICTED_W]))
+    command = n[flat.THRUST], rates, model, tau, int(n[flat.LIMITS])
+    return command, (a, b, c, d), _vec3(n[flat.PREDICTED_W])
 
 
 class PlainEngine:
     """The control step as plain Python."""
 
     def __init__(self, parameters: Parameters, lags: Factors) -> None:
-        self._parameters = parameters
+        self.retune(parameters)
         model = parameters.model
         self._vehicle = (model.mass, model.gravity, model.drag)
         self._lags = lags
-        self._controller: ControllerState | None = None
-        self._last: tuple[Command, ControllerState, Evaluation, State] | None = None
+        self._controller: PlainController | None = None
+        self._last: tuple[PlainCommand, PlainController, PlainEvaluation] | None = None
+        self._predicted: PlainState | None = None
+        self._pieces = [0.0] * (PIECE * PIECES_MAX)
+        self._last_s = math.nan
+        self.refreshed = False
 
     def begin(self, controller: ControllerState) -> None:
         """Takes a new controller state."""
-        self._controller = controller
+        thrust, thrust_rate, b_hat, heading, lead_integral = controller
+        self._controller = thrust, thrust_rate, b_hat, (*heading,), lead_integral
 
     @property
     def controller(self) -> ControllerState:
         """The controller's state after the last step."""
         assert self._controller is not None
-        return self._controller
+        return controller_of(self._controller)
 
     def retune(self, parameters: Parameters) -> None:
         """Steps with these parameters from now on; the model stays."""
-        self._parameters = parameters
+        gains, model, limits = parameters
+        self._p_max = gains.p_max
+        self._parameters: PlainParameters = (*gains,), (*model,), (*limits,)
 
     def relag(self, lags: Factors) -> None:
         """Steps with pieces of another length from now on."""
@@ -149,24 +220,97 @@ class PlainEngine:
         dt_s: float,
     ) -> Stepped:
         """One step (see Engine)."""
+        return self._step(state, reference, thrust, pieces, len(pieces) // PIECE, frozen, integrate, dt_s)
+
+    def _step(
+        self,
+        state: PlainState,
+        reference: Reference,
+        thrust: float,
+        pieces: Sequence[float],
+        count: int,
+        frozen: bool,
+        integrate: bool,
+        dt_s: float,
+    ) -> Stepped:
         controller = self._controller
         assert controller is not None
-        count = len(pieces) // PIECE
-        state, _ = through(state, thrust, pieces, 0, count, controller.b_hat, self._vehicle, self._lags)
-        command, after, out = step(state, reference, controller, self._parameters, frozen, dt_s)
+        _, _, b_hat, _, _ = controller
+        self._predicted, _ = through(state, thrust, pieces, 0, count, b_hat, self._vehicle, self._lags)
+        command, after, out = step_plain(self._predicted, reference, controller, self._parameters, frozen, dt_s)
         if integrate:
             self._controller = after
         else:
             after = controller
-        self._last = command, after, out, state
-        _, _, q, w = state
-        return new_record(Stepped, (command, q, w))
+        self._last = command, after, out
+        _, _, q, w = self._predicted
+        return command, q, w
 
     def numbers(self) -> Numbers:
         """All of the last step (see Engine)."""
-        assert self._last is not None
-        command, after, out, state = self._last
-        return flat.results(command, after, out, self._parameters.gains.p_max, state)
+        assert self._last is not None and self._predicted is not None
+        command, after, out = self._last
+        return flat.results(command, after, out, self._p_max, self._predicted)
+
+    # -- whole steps (see WholeSteps) -----------------------------------------------------------------------------
+
+    def convert(self, thrust_full_n: float, curve_factor: float) -> None:
+        """Turns thrust into commands so from now on."""
+        self._conversion = thrust_full_n, curve_factor
+
+    def predict(
+        self, commands: MutableSequence[float], lags_s: Vec3, delay_s: float, interval_s: float, gap_max_s: float
+    ) -> None:
+        """How whole steps are made from now on."""
+        self._commands, self._rate_lags_s, self._delay_s = commands, lags_s, delay_s
+        self._interval_s, self._gap_max_s = interval_s, gap_max_s
+
+    def fly(
+        self,
+        stamp_s: float,
+        state: State,
+        last_s: float | None,
+        reference_at: ReferenceAt,
+        attitude: Attitude | None,
+        frozen: bool,
+    ) -> Stepped:
+        """A whole step."""
+        dt_s, integrate = self._interval_s, True
+        if last_s is not None:
+            integrate = 0.0 < stamp_s - last_s <= self._gap_max_s  # else the controller's state waits
+            dt_s = stamp_s - last_s if integrate else dt_s
+        self._last_s = stamp_s
+        commands, pieces = self._commands, self._pieces
+        follow(commands, stamp_s)
+        count = gather(commands, stamp_s, pieces, 0)
+        self.refreshed = False
+        if attitude is not None:
+            lags_s = self._rate_lags_s
+            state, self.refreshed = history.refreshed(state, stamp_s, attitude, pieces, 0, count, lags_s)
+        reference, thrust = reference_at(stamp_s + self._delay_s), commands[THRUST]
+        out = self._step(state, reference, thrust, pieces, count, frozen or not integrate, integrate, dt_s)
+        (thrust, _, (x, y, z), _, _), _, _ = out
+        remember(commands, stamp_s + self._delay_s, thrust, x, y, z)
+        return out
+
+    def again(self, stamp_s: float, state: State, timed: Timed) -> RateSetpoint | None:
+        """A whole step like the last one: `fly`, without what makes no difference then."""
+        dt_s, controller = stamp_s - self._last_s, self._controller
+        if not 0.0 < dt_s <= self._gap_max_s or controller is None:
+            return None
+        self._last_s = stamp_s
+        commands, pieces, effect_s = self._commands, self._pieces, stamp_s + self._delay_s
+        follow(commands, stamp_s)
+        count = gather(commands, stamp_s, pieces, 0)
+        _, _, b_hat, _, _ = controller
+        thrust = commands[THRUST]
+        self._predicted, _ = through(state, thrust, pieces, 0, count, b_hat, self._vehicle, self._lags)
+        reference = timed(effect_s)
+        self._last = last = step_plain(self._predicted, reference, controller, self._parameters, False, dt_s)
+        (thrust, rates, (x, y, z), _, _), self._controller, _ = last
+        remember(commands, effect_s, thrust, x, y, z)
+        full_n, curve_factor = self._conversion
+        return new_record(RateSetpoint, (thrust_fraction(thrust, full_n, curve_factor), rates))
 
 
 class CompiledEngine:
@@ -193,7 +337,7 @@ class CompiledEngine:
         self._unpack_sent = struct.Struct("4d").unpack_from
         self._unpack = struct.Struct(f"{flat.RESULTS}d").unpack_from
         self._unpack_target = struct.Struct("6d").unpack_from
-        self._history = self._no_history
+        self._history: MutableSequence[float] = self._no_history  # type: ignore[assignment]
         self.on: Curve | None = None
         """The curve that the last step had its reference from."""
         self.curve: Any = self._no_curve
@@ -242,23 +386,17 @@ class CompiledEngine:
         """All of the last step (see Engine)."""
         return self._unpack(self._bytes, _RESULTS)
 
-    # -- whole steps ----------------------------------------------------------------------------------------------
+    # -- whole steps (see WholeSteps) -----------------------------------------------------------------------------
 
     def convert(self, thrust_full_n: float, curve_factor: float) -> None:
-        """Turns thrust into commands so from now on (`output.Conversion`)."""
+        """Turns thrust into commands so from now on."""
         self._m[fused.CONVERSION : fused.LAGS] = thrust_full_n, curve_factor
 
-    def predict(self, commands: Any, lags_s: Vec3, delay_s: float, interval_s: float, gap_max_s: float) -> None:
-        """How whole steps are made from now on.
-
-        Args:
-            commands: the history (`control.history`).
-            lags_s: of roll, pitch and yaw rate behind their setpoints [s].
-            delay_s: from a stamp to the effect of its command [s].
-            interval_s: in place of the time since the last step, where there is none to integrate over [s].
-            gap_max_s: the longest one to integrate over [s].
-        """
-        self._history = commands
+    def predict(
+        self, commands: MutableSequence[float], lags_s: Vec3, delay_s: float, interval_s: float, gap_max_s: float
+    ) -> None:
+        """How whole steps are made from now on."""
+        self._history, self._delay_s = commands, delay_s
         self._m[fused.LAGS : fused.WHOLE] = *lags_s, delay_s, interval_s, gap_max_s
 
     def fly(
@@ -269,30 +407,19 @@ class CompiledEngine:
         reference_at: ReferenceAt,
         attitude: Attitude | None,
         frozen: bool,
-    ) -> None:
-        """A whole step.
-
-        Args:
-            stamp_s: vehicle time of the state [s].
-            state: as received.
-            last_s: stamp of the step before [s]; None: this is the first.
-            reference_at: the reference as a function of vehicle time [s].
-            attitude: newer than the state.
-            frozen: hold the estimator still.
-        """
+    ) -> Stepped:
+        """A whole step."""
         self.refer(reference_at, stamp_s)
         self.give_attitude(attitude)
         self._m[fused.WHOLE : fused.ON_CURVE] = 1.0, math.nan if last_s is None else last_s, frozen
         self._pack(self._bytes, 0, stamp_s, *state.p, *state.v, *state.q, *state.w)
         self._kernel(self._m, self._history, self.curve)
+        return stepped(self.numbers())
 
-    def again(self, stamp_s: float, state: State) -> RateSetpoint:
-        """A whole step like the last one, which `fly` has made: on the same curve, with nothing newer than the state.
-
-        Args:
-            stamp_s: vehicle time of the state [s].
-            state: as received.
-        """
+    def again(self, stamp_s: float, state: State, timed: Timed) -> RateSetpoint | None:
+        """A whole step like the last one: on the same curve."""
+        if self.on is None or timed.on is not self.on or not timed.goes_on(stamp_s, self._delay_s):
+            return None
         (px, py, pz), (vx, vy, vz), (a, b, c, d), (x, y, z) = state
         self._pack(self._bytes, 0, stamp_s, px, py, pz, vx, vy, vz, a, b, c, d, x, y, z)
         self._kernel(self._m, self._history, self.curve)

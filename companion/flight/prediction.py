@@ -36,7 +36,7 @@ class Prediction:
     def __init__(self, thrust_lag_s: float, delay_s: float, thrust_n: float, engine: str = "python") -> None:
         self.numbers: MutableSequence[float] = accelerate.numbers(history.CAPACITY, engine)
         """The history, as `control.history` lays it out."""
-        self._out = accelerate.numbers(PIECE * PIECES_MAX, engine)
+        self._engine = engine
         self._thrust_lag_s = thrust_lag_s
         self._begin = accelerate.choose(history.begin, engine)
         self._remember = accelerate.choose(history.remember, engine)
@@ -59,7 +59,8 @@ class Prediction:
         count = math.ceil(delay_s / PIECE_MAX_S - 1e-9)
         self.length_s = delay_s / count if count else 0.0
         """Length of the pieces [s]; 0 without a delay."""
-        self.numbers[history.COUNT], self.numbers[history.LENGTH] = float(count), self.length_s
+        self.numbers[history.COUNT], self.numbers[history.LENGTH] = count, self.length_s
+        self._pieces = accelerate.numbers(PIECE * count, self._engine)
 
     @property
     def thrust(self) -> float:
@@ -72,6 +73,7 @@ class Prediction:
         h[history.THRUST] *= ratio
         for at in self._commands():
             h[at + 1] *= ratio
+            h[at + 5] *= ratio
 
     def sent(self, stamp_s: float, thrust_n: float, rates: Sequence[float]) -> None:
         """Remembers a command (thrust [N], body rates [rad/s]) computed from the state stamped `stamp_s`."""
@@ -82,9 +84,14 @@ class Prediction:
         self._follow(self.numbers, stamp_s)
 
     def pieces(self, stamp_s: float) -> Sequence[float]:
-        """What acts from a stamp until its own command will, `PIECE` numbers each; empty without a delay."""
-        self.follow(stamp_s)
-        return self._out[: PIECE * self._gather(self.numbers, stamp_s, self._out, 0)]
+        """What acts from a stamp until its own command will, `PIECE` numbers each; empty without a delay.
+
+        They hold until the next call.
+        """
+        h, pieces = self.numbers, self._pieces
+        self._follow(h, stamp_s)
+        self._gather(h, stamp_s, pieces, 0)
+        return pieces
 
     def between(self, begin_s: float, end_s: float) -> list[Span]:
         """What acts from the stamp that was asked for last to a later time [s]."""
@@ -93,7 +100,7 @@ class Prediction:
             until_s = h[at + history.COMMAND] if at != commands[-1] else math.inf
             duration_s = float(min(until_s, end_s) - max(h[at], begin_s))
             if duration_s > history.SHORTEST_S:
-                thrust, x, y, z = map(float, h[at + 1 : at + history.COMMAND])
+                thrust, x, y, z = map(float, h[at + 1 : at + 5])
                 out.append((thrust, (x, y, z), duration_s))
         return out
 

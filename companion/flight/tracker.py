@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from companion.config import Vehicle
 from companion.control import flat
 from companion.control.heading import HeadingState
-from companion.control.history import Attitude, refreshed
+from companion.control.history import THRUST, Attitude, refreshed
 from companion.control.law import LIMIT_THRUST_MAX, LIMIT_THRUST_MIN, ControllerState, Parameters, start
 from companion.control.model import PIECE, Factors, advance, factors
 from companion.control.output import (
@@ -29,7 +29,16 @@ from companion.control.types import GRAVITY_M_S2, State, Vec3
 from companion.control.vectors import add, axes, norm
 from companion.control.vectors import scale as scale_vector
 from companion.flight.course import Timed
-from companion.flight.engines import CompiledEngine, Engine, Kernels, Numbers, ReferenceAt, Stepped, stepped
+from companion.flight.engines import (
+    CompiledEngine,
+    Engine,
+    Kernels,
+    Numbers,
+    PlainEngine,
+    ReferenceAt,
+    Stepped,
+    WholeSteps,
+)
 from companion.flight.prediction import Prediction
 from companion.flight.reflex import DECLINED, Reflex
 from companion.flight.resets import Reset, about_vertical
@@ -144,7 +153,7 @@ class Tracker(Stepping):
         self._prediction = Prediction(vehicle.rotors.lag_s, self.delay_s, 0.0, compiled.engine)
         self._lags = self._factors()
         self._same: Timed | None = None
-        """The reference of the last step, on a curve, if nothing but its state need be new in the next one."""
+        """The reference of the last step, if nothing but its state need be new in the next one."""
         self._build: Callable[[Parameters], Engine] = lambda parameters: compiled.build(parameters, self._lags)
         self._use(self._build(self.parameters))
         self._scale = ThrustScale(vehicle) if vehicle.controller.thrust_scale_estimate else None
@@ -166,7 +175,8 @@ class Tracker(Stepping):
     def _use(self, engine: Engine) -> None:
         """Steps with this engine from now on."""
         self._engine = engine
-        self._whole = engine if isinstance(engine, CompiledEngine) else None
+        self._compiled = engine if isinstance(engine, CompiledEngine) else None
+        self._whole: WholeSteps | None = engine if isinstance(engine, PlainEngine | CompiledEngine) else None
         self._same = None
         self._inform()
 
@@ -214,11 +224,11 @@ class Tracker(Stepping):
         """
         timed = self._same
         if timed is not None and timed is reference_at and self._attitude is None and not frozen:
-            whole = self._whole
-            if whole is not None and timed.on is whole.on and timed.goes_on(stamp_s, self.delay_s):
-                self._last_s, self._seen = stamp_s, state
-                self._setpoint = setpoint = whole.again(stamp_s, state)
-                return setpoint
+            assert self._whole is not None
+            sent = self._whole.again(stamp_s, state, timed)
+            if sent is not None:
+                self._last_s, self._seen, self._setpoint = stamp_s, state, sent
+                return sent
         last_s = self._last_s
         self._last_s, self._seen, self._same = stamp_s, state, None
         gap = last_s is not None and not 0.0 < stamp_s - last_s <= self._gap_max_s  # the controller's state waits
@@ -237,13 +247,15 @@ class Tracker(Stepping):
         else:
             out = self._fly(self._whole, stamp_s, state, last_s, reference_at, frozen)
         self._setpoint = self._convert(out, dt_s)
-        if self._scale is not None and out.command.limits & THRUST_LIMITS:
-            self._scale.interrupt()
+        if self._scale is not None:
+            (_, _, _, _, limits), _, _ = out
+            if limits & THRUST_LIMITS:
+                self._scale.interrupt()
         return self._setpoint
 
     def last_step(self) -> TrackerStep:
         """All that is known of the last step."""
-        whole, setpoint = self._whole, self._setpoint
+        whole, setpoint = self._compiled, self._setpoint
         target = None if whole is None else whole.target
         if setpoint is None:
             assert whole is not None
@@ -256,7 +268,7 @@ class Tracker(Stepping):
         Returns:
             what `reflex.reflex` does.
         """
-        whole = self._whole
+        whole = self._compiled
         same = self._delay_wanted_s is None and self._transition is None and self._scale is None
         if whole is None or self._last_s is None or not (same and self._by_rates):
             return DECLINED
@@ -266,24 +278,24 @@ class Tracker(Stepping):
 
     def answered(self, stamp_s: float, state: State) -> None:
         """The step that `answer` has made was for this state."""
-        assert self._whole is not None
+        assert self._compiled is not None
         self._last_s, self._seen, self._setpoint = stamp_s, state, None
         if self._attitude is not None:
             if self._attitude.at_s <= stamp_s:
                 self._attitude = None
-            self.refreshed += self._whole.refreshed
+            self.refreshed += self._compiled.refreshed
 
     @property
     def memory(self) -> tuple[Any, Any] | None:
         """What the last step worked on, and its curve (`fused.flight_step`), where it was one call and its reference on
         a curve; else None."""
-        whole = self._whole
+        whole = self._compiled
         return (whole.memory, whole.curve) if whole is not None and whole.on is not None else None
 
     def _step(
         self, stamp_s: float, state: State, dt_s: float, gap: bool, reference_at: ReferenceAt, frozen: bool
     ) -> Stepped:
-        """The step put together here; `gap`: it is too long to integrate over."""
+        """The step of two engines at once, put together here; `gap`: it is too long to integrate over."""
         prediction = self._prediction
         pieces = prediction.pieces(stamp_s)
         if self._attitude is not None:
@@ -292,14 +304,15 @@ class Tracker(Stepping):
             state, used = refreshed(state, stamp_s, self._attitude, pieces, 0, count, (x, y, z))
             self.refreshed += used
         reference = reference_at(stamp_s + self.delay_s)
-        out = self._engine.step(state, reference, prediction.thrust, pieces, frozen or gap, not gap, dt_s)
-        thrust, _, rates_model, _, _ = out.command
+        thrust = prediction.numbers[THRUST]
+        out = self._engine.step(state, reference, thrust, pieces, frozen or gap, not gap, dt_s)
+        (thrust, _, rates_model, _, _), _, _ = out
         prediction.sent(stamp_s, thrust, rates_model)
         return out
 
     def _fly(
         self,
-        whole: CompiledEngine,
+        whole: WholeSteps,
         stamp_s: float,
         state: State,
         last_s: float | None,
@@ -307,12 +320,12 @@ class Tracker(Stepping):
         frozen: bool,
     ) -> Stepped:
         """The step as one call; whether the next one may be like it, is remembered."""
-        whole.fly(stamp_s, state, last_s, reference_at, self._attitude, frozen)
+        out = whole.fly(stamp_s, state, last_s, reference_at, self._attitude, frozen)
         self.refreshed += whole.refreshed
         steady = self._transition is None and self._scale is None and not frozen
-        if steady and self._by_rates and whole.on is not None and isinstance(reference_at, Timed):
+        if steady and self._by_rates and isinstance(reference_at, Timed):
             self._same = reference_at
-        return stepped(whole.numbers())
+        return out
 
     # -- the thrust's scale ---------------------------------------------------------------------------------------
 

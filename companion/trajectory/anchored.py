@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import cos, hypot, sin
 from typing import Literal
@@ -110,14 +111,21 @@ class Anchored:
     def at(self, t_s: float) -> Reference:
         """Return the reference at a time since the start [s], any time."""
         trajectory = self.trajectory
-        if t_s > trajectory.duration_s:
+        if 0.0 <= t_s <= trajectory.duration_s:
+            return self._placed(trajectory.at(t_s))
+        if t_s > 0.0:
             pace = run_out(t_s - trajectory.duration_s, self.run_out_s)
             return self._placed(paced(trajectory.at(trajectory.duration_s + pace[0]), pace))
-        if t_s < 0.0:
-            # The run-out mirrored in time: odd derivatives of the path's time keep their sign, even ones change it.
-            f0, f1, f2, f3, f4 = run_out(-t_s, self.run_up_s)
-            return self._placed(paced(trajectory.at(-f0), (-f0, f1, -f2, f3, -f4)))
-        return self._placed(trajectory.at(t_s))
+        # The run-out mirrored in time: odd derivatives of the path's time keep their sign, even ones change it.
+        f0, f1, f2, f3, f4 = run_out(-t_s, self.run_up_s)
+        return self._placed(paced(trajectory.at(-f0), (-f0, f1, -f2, f3, -f4)))
+
+    @property
+    def inside(self) -> Callable[[float], Reference]:
+        """What gives the same as `at` within [0, duration_s]: the shape itself, where nothing has to be done to it."""
+        trajectory = self.trajectory
+        as_it_is = trajectory.time_scale == 1.0 and self.yaw_rad == 0.0 and self.offset_m == ZERO
+        return trajectory.shape.at if as_it_is else self.at
 
     def joints(self) -> tuple[Joint, ...]:
         """Where pieces of the trajectory meet, with the exact values on either side."""
@@ -136,8 +144,8 @@ class Anchored:
         return replace(self, trajectory=trajectory, run_out_s=run_out_duration_s(hypot(*trajectory.at(t_s).v)))
 
     def _placed(self, reference: Reference) -> Reference:
-        p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
         turned = self.yaw_rad
+        p, v, a, j, s, yaw, yaw_rate, yaw_acceleration = reference
         if turned != 0.0:
             cos_yaw, sin_yaw = self.cos_yaw, self.sin_yaw
             p, v, a = rotated(cos_yaw, sin_yaw, p), rotated(cos_yaw, sin_yaw, v), rotated(cos_yaw, sin_yaw, a)

@@ -218,19 +218,14 @@ class Lemniscate(Shape):
         """Return the reference on the figure of eight."""
         w = self.angular_rate_rad_s
         u = 2.0 * w
-        w2 = w * w
-        u2 = u * u
         (north, east), (x, y, z), (yaw, yaw_rate) = self.amplitude_m, self.center_m, self.heading
-        nc, ns = north * cos(w * t_s), north * sin(w * t_s)
-        ec, es = east * cos(u * t_s), east * sin(u * t_s)
-        derivatives = (
-            (x + nc, y + es, z),
-            (-w * ns, u * ec, 0.0),
-            (-w2 * nc, -u2 * es, 0.0),
-            (w2 * w * ns, -u2 * u * ec, 0.0),
-            (w2 * w2 * nc, u2 * u2 * es, 0.0),
-        )
-        return new_record(Reference, (*derivatives, yaw + yaw_rate * t_s, yaw_rate, 0.0))
+        angle, double = w * t_s, u * t_s
+        n0, n1, e0, e1 = north * cos(angle), -w * north * sin(angle), east * sin(double), u * east * cos(double)
+        # two derivatives on, a sine is itself again, times minus the square of its rate
+        w2, u2 = -w * w, -u * u
+        n2, n3, e2, e3 = w2 * n0, w2 * n1, u2 * e0, u2 * e1
+        p, v, a, j, s = (x + n0, y + e0, z), (n1, e1, 0.0), (n2, e2, 0.0), (n3, e3, 0.0), (w2 * n2, u2 * e2, 0.0)
+        return new_record(Reference, (p, v, a, j, s, yaw + yaw_rate * t_s, yaw_rate, 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

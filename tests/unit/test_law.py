@@ -114,9 +114,9 @@ def test_what_the_heading_is_told_of_the_force_is_a_direction_and_its_two_deriva
     told = []
     heard = law.heading_torque
 
-    def listen(state, ref, force, *rest):
+    def listen(w, path, wanted, force, *rest):
         told.append(force)
-        return heard(state, ref, force, *rest)
+        return heard(w, path, wanted, force, *rest)
 
     world = World((truth[0] * MASS, truth[1] * MASS, truth[2] * MASS), G, drag)
     state = State(start, (0.3, 1.2, 0.2), (0.98, 0.1, -0.05, 0.16), (0.1, -0.2, 0.3))
@@ -308,7 +308,7 @@ def test_while_the_estimate_does_not_follow_the_heading_is_told_of_the_reference
 ):
     told = []
     heard = law.heading_torque
-    monkeypatch.setattr(law, "heading_torque", lambda *said: told.append(said[2]) or heard(*said))
+    monkeypatch.setattr(law, "heading_torque", lambda *said: told.append(said[3]) or heard(*said))
     p = parameters(drag=0.3, limits=TIGHT)
     ctrl = ControllerState(MASS * G, 1.0, b_hat, memory(), ZERO)
     ref = rising(1.0)

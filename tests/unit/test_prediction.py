@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from companion.control import history
-from companion.control.model import advance, factors, lagged
+from companion.control.model import advance, factors
 from companion.control.types import State
 from companion.control.vectors import axes, quat_exp, quat_multiply, quat_normalise
 from companion.flight.prediction import PIECE_MAX_S, Prediction
@@ -41,32 +41,38 @@ def test_the_model_agrees_with_an_integrated_rigid_body():
     assert errors[1][:3].max() < 1e-5
 
 
+def integral(commands, k, begin_s, end_s):
+    """Of number k of commands, each given with the time from which it acts, over a time."""
+    until = [since for since, _ in commands[1:]] + [math.inf]
+    spans = [max(0.0, min(end, end_s) - max(since, begin_s)) for (since, _), end in zip(commands, until, strict=True)]
+    return sum(span * command[k] for span, (_, command) in zip(spans, commands, strict=True) if span > 0.0)
+
+
 @given(
     delay=st.floats(0.001, 0.09),
     interval=st.floats(0.003, 0.03),
-    jitter=st.lists(st.floats(0.7, 1.4), min_size=30, max_size=30),
+    jitter=st.lists(st.floats(0.7, 1.4), min_size=60, max_size=60),
 )
-def test_pieces_cover_the_delay_with_the_commands_in_their_order(delay, interval, jitter):
-    """The integral of the commands over any delay is that of the piecewise constant history."""
+def test_every_piece_is_the_mean_of_the_commands_that_act_in_it(delay, interval, jitter):
+    """Before the first command acts, what holds the hover does; a new scale is one for all that is under way."""
     prediction = Prediction(0.05, delay, 10.0)
-    stamp, sent = 1.0, []
+    stamp, sent = 1.0, [(-math.inf, (10.0, 0.0, 0.0, 0.0))]
     for i, factor in enumerate(jitter):
-        numbers = prediction.pieces(stamp)
-        pieces = [(t, (x, y, z), s) for t, x, y, z, s in zip(*[iter(numbers)] * 5, strict=True)]
-        if sent:
-            assert sum(p[2] for p in pieces) == pytest.approx(delay)
-            assert max(p[2] for p in pieces) <= PIECE_MAX_S + 1e-9
-            total = sum(p[1][0] * p[2] for p in pieces)
-            expected = 0.0
-            for k, (since, value) in enumerate(sent):
-                end = sent[k + 1][0] if k + 1 < len(sent) else math.inf
-                begin = since
-                expected += value * max(0.0, min(end, stamp + delay) - max(begin, stamp))
-            assert total == pytest.approx(expected, abs=1e-4 * delay + 1e-6 * 30)
-        elif pieces:
-            assert all(p[0] == pytest.approx(10.0) and p[1] == (0.0, 0.0, 0.0) for p in pieces)  # the hover
-        prediction.sent(stamp, 10.0 + i, (float(i), 0.0, 0.0))
-        sent.append((stamp + delay, float(i)))
+        pieces = list(zip(*[iter(prediction.pieces(stamp))] * 5, strict=True))
+        assert sum(piece[4] for piece in pieces) == pytest.approx(delay)
+        begin_s = stamp
+        for *means, duration_s in pieces:
+            assert duration_s <= PIECE_MAX_S + 1e-9
+            for k, mean in enumerate(means):
+                expected = integral(sent, k, begin_s, begin_s + duration_s)
+                assert mean * duration_s == pytest.approx(expected, abs=5.0 * history.SHORTEST_S)
+            begin_s += duration_s
+        command = (10.0 + i, float(i), -2.0 * i, 0.5 * i)
+        prediction.sent(stamp, command[0], command[1:])
+        sent.append((stamp + delay, command))
+        if i == 40:
+            prediction.rescale(1.5)
+            sent = [(since, (1.5 * thrust, *rates)) for since, (thrust, *rates) in sent]
         stamp += interval * factor
 
 
@@ -78,7 +84,7 @@ def test_the_thrust_at_the_stamp_is_followed_with_the_lag():
         assert prediction.thrust == pytest.approx(expected)
         setpoint = 10.0 + math.sin(0.3 * i)
         prediction.sent(stamp, setpoint, (0.0, 0.0, 0.0))
-        expected = lagged(expected, setpoint, 0.05, 0.01)[0]
+        expected = setpoint + (expected - setpoint) * math.exp(-0.01 / 0.05)
         stamp += 0.01
 
 
@@ -95,7 +101,7 @@ def test_a_history_that_overflows_forgets_its_oldest_and_one_that_goes_on_stays_
         full.sent(1e-4 * i, float(i), (0.0, 0.0, 0.0))
     spans = full.between(0.0, 10.0)
     assert [thrust for thrust, _, _ in spans][-3:] == [2997.0, 2998.0, 2999.0]
-    assert len(spans) == (history.CAPACITY - history.COMMANDS) // history.COMMAND
+    assert len(spans) == (history.CAPACITY - history.COMMANDS) // history.COMMAND - 1  # room for one is kept
     going_on, most = Prediction(0.05, 0.04, 10.0, engine), 0
     for i in range(3000):
         going_on.pieces(0.004 * i)
