@@ -105,18 +105,27 @@ class Flown:
 
     Args:
         count: so many states, rounded up to whole CALLS; after them they come again.
+        kept: a file in which another process keeps the states of as many; simulated anew without.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, kept: Path | None = None) -> None:
         self.count = count = CALLS * -(-count // CALLS)
         flight = load_flight("paper")
         self.vehicle = flight.vehicle
         start, yaw = start_of(flight)
         trajectory = replace(load("paper"), duration_s=FLOWN_S)
         self.course = Course(trajectory, self.vehicle, start, yaw, (0.0, 0.0, 0.0), flight.height_min_m)
+        if kept is not None:
+            told = json.loads(kept.read_text())
+            self.states = [(t_s, State(*(tuple(vector) for vector in state))) for t_s, state in told]
+            return
         most_s = SETTLED_S + (count + MARGIN) / self.vehicle.link.state_rate_hz
         rows = fly_sampled(flight, trajectory, kernels(engines()[-1]), duration_max_s=most_s).rows
         self.states = [(row.t_s, row.state) for row in rows if row.t_s >= SETTLED_S]
+
+    def keep(self, file: Path) -> None:
+        """Writes the states for another process."""
+        file.write_text(json.dumps(self.states))
 
     def begin(self, tracker: Tracker, timed: Timed, i: int) -> tuple[int, State]:
         """Begins anew with a state; gives its stamp [us], and the state."""
@@ -261,23 +270,25 @@ def physics_rows(setting: Setting) -> list[Row]:
 
 
 def instruction_rows(setting: Setting) -> list[Row]:
-    """Instructions per control step, counted by callgrind: they do not depend on what else the machine does."""
+    """Instructions per control step, counted by callgrind: they do not depend on what else the machine does.
+
+    Callgrind shows the program a processor of its own, for which the compiled engine would be compiled anew, for many
+    minutes there: both sides of it are told to be any processor, and the code is compiled outside.
+    """
     if shutil.which("valgrind") is None:
         raise NotHereError("needs valgrind")
     rows = []
+    kept = setting.folder / "states.json"
+    Flown(CALLS).keep(kept)  # what is counted must be steps, and no simulation
+    environment = {**module_environment(), "PYTHONHASHSEED": "0", "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     for engine in engines():
         counts = []
-        # The first run may compile: callgrind shows the program a processor of its own, for which nothing is kept yet.
-        for steps in (1, 200, 700) if engine == "numba" else (200, 700):
+        steps_of = [PYTHON, "-m", "benchmarks.arithmetic", engine]
+        subprocess.run([*steps_of, "1", str(kept)], env=environment, timeout=900, check=True)
+        out = f"--callgrind-out-file={setting.folder / 'callgrind.out'}"
+        for steps in (200, 700):
             setting.say(f"instructions of {steps} control steps, {engine}")
-            command = [
-                "valgrind",
-                "--tool=callgrind",
-                f"--callgrind-out-file={setting.folder / 'callgrind.out'}",
-                PYTHON,
-            ]
-            command += ["-m", "benchmarks.arithmetic", engine, str(steps)]
-            environment = {**module_environment(), "PYTHONHASHSEED": "0"}
+            command = ["valgrind", "--tool=callgrind", out, *steps_of, str(steps), str(kept)]
             done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900, check=False)
             found = re.search(r"Collected : (\d+)", done.stderr)
             if found is None:
@@ -322,5 +333,4 @@ def growth_rows(setting: Setting) -> list[Row]:
 if __name__ == "__main__":
     import sys
 
-    number = int(sys.argv[2])
-    control_steps(sys.argv[1], Flown(number)).times_us(number, number)
+    control_steps(sys.argv[1], Flown(CALLS, Path(sys.argv[3]))).times_us(int(sys.argv[2]), CALLS)
