@@ -119,7 +119,7 @@ class Px4Link:
                     raise Px4GoneError(f"takes no data for {_SEND_S:g} s") from None
                 select.select([], [self._socket], [], min(left_s, _SLICE_S))
             except OSError as error:
-                raise Px4GoneError(error.strerror or str(error)) from None
+                raise _gone(error) from None
 
     def receive(self, timeout_s: float) -> list[Frame]:
         """Wait for data, at most timeout_s; gives the frames that are whole. Raises Px4GoneError when PX4 has left."""
@@ -130,7 +130,7 @@ class Px4Link:
         except BlockingIOError:
             return []
         except OSError as error:
-            raise Px4GoneError(error.strerror or str(error)) from None
+            raise _gone(error) from None
         if not data:
             raise Px4GoneError("closed the connection")
         whole, self._rest = split(self._rest + data)
@@ -141,6 +141,12 @@ class Px4Link:
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
+
+
+def _gone(error: OSError) -> Px4GoneError:
+    """Whoever leaves with something unread resets the connection, which is no other way to close it."""
+    closed = isinstance(error, ConnectionError)
+    return Px4GoneError("closed the connection" if closed else f"cannot be reached ({error.strerror or error})")
 
 
 def controls_of(frame: Frame) -> Controls:

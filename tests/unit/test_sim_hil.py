@@ -234,6 +234,19 @@ def test_a_px4_that_leaves_ends_the_world_and_the_next_one_finds_it_at_its_start
         world.close()
 
 
+def test_a_px4_that_leaves_with_something_unread_has_closed_the_connection_too() -> None:
+    """Its system then resets the connection."""
+    with flying() as (world, px4):
+        px4.fly(10)
+        assert select.select([px4.socket], [], [], 5.0)[0]
+        px4.close()
+        second = FakePx4(world.port)
+        second.sample()
+        assert next(s for s in world.said if "has left" in s).startswith("PX4 has left: it closed the connection")
+        world.stop = True
+        second.close()
+
+
 def test_a_second_px4_is_sent_away() -> None:
     with flying() as (world, px4):
         px4.fly(2)
