@@ -74,8 +74,13 @@ def begin(h: MutableSequence[float], thrust_n: float, thrust_lag_s: float) -> No
 
 
 def remember(h: MutableSequence[float], from_s: float, thrust_n: float, x: float, y: float, z: float) -> None:
-    """Appends a command: the time from which it acts [s], thrust setpoint [N] and body rate setpoints [rad/s]."""
+    """Appends a command: the time from which it acts [s], thrust setpoint [N] and body rate setpoints [rad/s].
+
+    What was to act later than it does not act any more.
+    """
     start, end = int(h[BEGIN]), int(h[END])
+    while h[end - COMMAND] > from_s and end - start > COMMAND:
+        end -= COMMAND
     if end + 2 * COMMAND > CAPACITY or start - COMMANDS >= FORGOTTEN_MAX:
         end = _make_room(h, start, end)
     if not -SHORTEST_S < from_s - h[end] < SHORTEST_S:  # else `gather` has summed already
@@ -114,7 +119,10 @@ def _make_room(h: MutableSequence[float], start: int, end: int) -> int:
 
 
 def follow(h: MutableSequence[float], stamp_s: float) -> None:
-    """Brings the modelled thrust to a stamp [s] and forgets commands that have ceased to act."""
+    """Brings the modelled thrust to a stamp [s] and forgets commands that have ceased to act.
+
+    To an earlier stamp it goes on from where it is: such states are not flown by (`link.telemetry`).
+    """
     at_s, lag_s, thrust = h[AT], h[LAG], h[THRUST]
     h[AT] = stamp_s
     i, end = int(h[BEGIN]), int(h[END])

@@ -1,9 +1,9 @@
 """The adaptive backstepping law with thrust by dynamic extension (sections I-IV of the paper), as pure functions.
 
-Read it top down: `evaluate` has the errors (8) (25) (30) (15), the estimator (33) and (19) (34) (20), and gives the
-derivatives of the controller's state and the angular acceleration; `step` integrates those derivatives over one sample
-and limits them. `evaluate` is the continuous form: an ODE integrator can call it. `step` calls the same function: there
-is one set of equations.
+Read it top down: `evaluate_plain` has the errors (8) (25) (30) (15), the estimator (33) and (19) (34) (20), and gives
+the derivatives of the controller's state and the angular acceleration; `step_plain` integrates those derivatives over
+one sample and limits them. `evaluate` and `step` are the same with names. `evaluate` is the continuous form: an ODE
+integrator can call it. There is one set of equations.
 
 The drag D is part of the model: q2, q3, q4 stand wherever the paper has p_d'', p_d''', p_d''''. What the print gets
 wrong is listed in docs/law.md. All functions are kernels (see `companion.accelerate`): plain Python, or compiled from

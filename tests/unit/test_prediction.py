@@ -76,6 +76,23 @@ def test_every_piece_is_the_mean_of_the_commands_that_act_in_it(delay, interval,
         stamp += interval * factor
 
 
+@given(
+    delay=st.floats(0.001, 0.2),
+    commands=st.lists(st.tuples(st.floats(-0.02, 0.03), st.sampled_from([-5.0, 5.0])), min_size=2, max_size=60),
+)
+def test_a_mean_lies_between_the_commands_whatever_the_stamps_do(delay, commands):
+    """Also where a command acts before the one that was sent before it: with stamps that go back, or less delay."""
+    prediction, stamp = Prediction(0.05, delay, 10.0), 1.0
+    for i, (interval, rate) in enumerate(commands):
+        for thrust, x, y, z, _ in zip(*[iter(prediction.pieces(stamp))] * 5, strict=True):
+            assert 10.0 - 1e-6 <= thrust <= 15.0 + 1e-6
+            assert all(abs(mean) <= 5.0 + 1e-6 for mean in (x, y, z))
+        prediction.sent(stamp, 12.5 + 0.5 * rate, (rate, -rate, rate))
+        if i == 20:
+            prediction.retime(0.5 * delay)
+        stamp += interval
+
+
 def test_the_thrust_at_the_stamp_is_followed_with_the_lag():
     prediction = Prediction(0.05, 0.0, 10.0)
     stamp, expected = 0.0, 10.0
