@@ -91,8 +91,7 @@ class Conversion(NamedTuple):
 
 def thrust_fraction(thrust_n: float, full_n: float, curve_factor: float) -> float:
     """The thrust command that gives `thrust_n`: the inverse of the thrust curve, within 0 to 1."""
-    share = thrust_n / full_n
-    share = 0.0 if share < 0.0 else 1.0 if share > 1.0 else share
+    share = clip(thrust_n / full_n, 0.0, 1.0)
     if curve_factor < 1e-6:
         return share
     half = 0.5 * (1.0 - curve_factor) / curve_factor
@@ -101,8 +100,7 @@ def thrust_fraction(thrust_n: float, full_n: float, curve_factor: float) -> floa
 
 def rates_output(thrust_n: float, rates: Vec3, conversion: Conversion) -> RateSetpoint:
     """Body rates and thrust as they are."""
-    full_n, curve_factor, _, _, _, _ = conversion
-    share = thrust_fraction(thrust_n, full_n, curve_factor)
+    share = thrust_fraction(thrust_n, conversion.thrust_full_n, conversion.curve_factor)
     return new_record(RateSetpoint, (share, rates))
 
 

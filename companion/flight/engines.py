@@ -220,20 +220,7 @@ class PlainEngine:
         dt_s: float,
     ) -> Stepped:
         """One step (see Engine)."""
-        return self._step(state, reference, thrust, pieces, len(pieces) // PIECE, frozen, integrate, dt_s)
-
-    def _step(
-        self,
-        state: PlainState,
-        reference: Reference,
-        thrust: float,
-        pieces: Sequence[float],
-        count: int,
-        frozen: bool,
-        integrate: bool,
-        dt_s: float,
-    ) -> Stepped:
-        controller = self._controller
+        controller, count = self._controller, len(pieces) // PIECE
         assert controller is not None
         _, _, b_hat, _, _ = controller
         self._predicted, _ = through(state, thrust, pieces, 0, count, b_hat, self._vehicle, self._lags)
@@ -288,7 +275,7 @@ class PlainEngine:
             lags_s = self._rate_lags_s
             state, self.refreshed = history.refreshed(state, stamp_s, attitude, pieces, 0, count, lags_s)
         reference, thrust = reference_at(stamp_s + self._delay_s), commands[THRUST]
-        out = self._step(state, reference, thrust, pieces, count, frozen or not integrate, integrate, dt_s)
+        out = self.step(state, reference, thrust, pieces[: PIECE * count], frozen or not integrate, integrate, dt_s)
         (thrust, _, (x, y, z), _, _), _, _ = out
         remember(commands, stamp_s + self._delay_s, thrust, x, y, z)
         return out
